@@ -212,10 +212,9 @@ def calibrate_lens(found: Iterable[Sighting | Rejected], width: int, height: int
     boards = [s for s in results if isinstance(s, Sighting)]
     if len(boards) < MIN_BOARDS:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in rejected[:3])
-        raise ReceiverError(
-            f"{len(boards)} usable boards, at least {MIN_BOARDS} are needed ({reasons or 'no pictures'})",
-            "check --board (inner corners), and take 10 to 20 sharp pictures at different tilts",
-        )
+        reason = f"{len(boards)} usable boards, at least {MIN_BOARDS} are needed ({reasons or 'no pictures'})"
+        hint = "check --board (inner corners), and take 10 to 20 sharp pictures at different tilts"
+        raise ReceiverError(reason, hint)
     while True:
         fit = _fit(boards, rejected, (width, height))
         errors = np.array(list(fit.accepted.values()))

@@ -104,15 +104,9 @@ def _rows_and_slow(n: int, n_slow: int) -> tuple[FloatArray, FloatArray]:
     return rows, np.asarray(np.polynomial.chebyshev.chebvander(2 * rows / n, n_slow - 1), np.float64)
 
 
-def _basis(n: int, frequency: float, n_harmonics: int) -> FloatArray:
-    """(n, 4 + 2 H) orthonormal basis of a cubic and, after it, the harmonics."""
-    rows, slow = _rows_and_slow(n, 4)
-    return np.asarray(np.linalg.qr(np.hstack([slow, *_waves(rows, frequency, n_harmonics)]))[0])
-
-
-def _detrend(profiles: FloatArray) -> FloatArray:
-    """Profiles less their least-squares cubic."""
-    basis = _basis(profiles.shape[1], 0, 0)
+def _detrend(profiles: FloatArray, n_terms: int) -> FloatArray:
+    """Profiles (..., n) less their least-squares polynomial of `n_terms` terms; a cubic has four."""
+    basis = np.linalg.qr(_rows_and_slow(profiles.shape[-1], n_terms)[1])[0]
     return np.asarray(profiles - (profiles @ basis) @ basis.T)
 
 
@@ -130,7 +124,7 @@ def search(profiles: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
         share of the lines' power, less one per cent a harmonic; zero where no line stands out.
     """
     n = profiles.shape[1]
-    power = np.abs(np.fft.rfft(_detrend(profiles) * np.hanning(n), _PAD * n)) ** 2 + 1e-300
+    power = np.abs(np.fft.rfft(_detrend(profiles, 4) * np.hanning(n), _PAD * n)) ** 2 + 1e-300
     frequency = np.fft.rfftfreq(_PAD * n)
     low, high = (frequency > 3 / n) & (frequency < max(0.1, 6 / n)), frequency > 0.3
     scene = np.median(power[:, low] * frequency[low] ** 2, axis=1, keepdims=True) / np.log(2)
@@ -173,8 +167,10 @@ def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -
     max_slow = max(frequency * n, 2.0)
     candidates = (frequency * ratio for ratio in (3, 2, 1, 1 / 2, 1 / 3))
     inside = [f for f in candidates if 1.5 / n <= f <= MAX_FREQUENCY]
-    flat = _detrend(profile[None])[0]
-    shares = [float(np.sum((flat @ _basis(n, f, 5)[:, 4:]) ** 2)) for f in inside]
+    (rows, slow), flat = _rows_and_slow(n, 4), _detrend(profile, 4)
+    # The power of five harmonics beside a cubic.
+    bases = (np.linalg.qr(np.hstack([slow, *_waves(rows, f, 5)]))[0] for f in inside)
+    shares = [float(np.sum((flat @ basis[:, 4:]) ** 2)) for basis in bases]
     best: PeriodicFit | None = None
     for candidate, share in zip(inside, shares, strict=True):
         fit = fit_periodic(profile, candidate, first_row, max_slow) if share >= 0.6 * max(shares) else None
@@ -342,8 +338,7 @@ def explained_share(profiles: FloatArray, template: FloatArray) -> FloatArray:
     Returns:
         (k,) share of the variance, negative where the template fits upside down.
     """
-    basis, _ = np.linalg.qr(_rows_and_slow(template.size, 2)[1])
-    flat, wave = (part - (part @ basis) @ basis.T for part in (profiles, template))
+    flat, wave = _detrend(profiles, 2), _detrend(template, 2)
     product = flat @ wave
     return np.asarray(np.sign(product) * product**2 / (float(wave @ wave) * np.sum(flat**2, axis=1) + 1e-300))
 

@@ -37,10 +37,8 @@ def calibrate_slots(frames: Sequence[Frame], screen: ScreenProfile, axis: Axis =
     confirmed = [r.estimated for r in results if any(p.confidence >= _MIN_CONFIDENCE for p in r.packets)]
     if not confirmed:
         reason = next((f" ({r.message.split(';')[0]})" for r in results if r.message), "")
-        raise ReceiverError(
-            f"no slot clock of a sending screen in the pictures{reason}",
-            "let the whole screen show and use a short exposure; at least two rows a slot are needed",
-        )
+        hint = "let the whole screen show and use a short exposure; at least two rows a slot are needed"
+        raise ReceiverError(f"no slot clock of a sending screen in the pictures{reason}", hint)
     value, sd = weighted_mean(*zip(*(estimated["line_delay_s"] for estimated in confirmed), strict=True))
     bent = any("k1" in estimated for estimated in confirmed)
     warning = "the camera corrected its lens distortion: line delay and distortion were estimated together"

@@ -18,6 +18,7 @@ from rxcli.calibrate.lensfun import lens_from_database
 from rxcli.calibrate.picture import write_residuals
 from rxcli.calibrate.saving import profile_to_extend, with_lens, with_mode, write_profile
 from rxcli.calibrate.shutter import ShutterCalibration, calibrate_shutter
+from rxcli.calibrate.slots import calibrate_slots
 from rxcli.cli.common import claim_outputs, force_argument, json_output, options, write_json
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.errors import InputError, UsageError
@@ -119,8 +120,7 @@ def _files(paths: tuple[Path, ...]) -> list[Path]:
 
 
 def _lens_record(model: LensModel) -> dict[str, Any]:
-    keys = ("camera_matrix", "dist_coeffs", "width", "height")
-    return {key: getattr(model, key) for key in keys}
+    return {key: getattr(model, key) for key in ("camera_matrix", "dist_coeffs", "width", "height")}
 
 
 def _distortion(model: LensModel) -> tuple[str, str]:
@@ -150,7 +150,7 @@ class _BoardReader:
         self.metadata: Metadata | None = None
 
     def read(self, paths: list[Path]) -> Iterator[tuple[str, GrayImage]]:
-
+        """Name and grey picture of each board picture."""
         for path in paths:
             try:
                 for frame in islice(open_source(path), 0, None, self._every):
@@ -237,9 +237,8 @@ def shutter(
     Let the lamp fill much of the frame, out of focus, with an exposure well below half a period.
     """
     if bool(frequencies) == bool(screen):
-        raise UsageError(
-            "either --frequency or --screen is needed", "give the frequency of the lamp, as --frequency 1000"
-        )
+        hint = "give the frequency of the lamp, as --frequency 1000"
+        raise UsageError("either --frequency or --screen is needed", hint)
     for value, option, limit in (*((f, "--frequency", 1e7) for f in frequencies), (exposure_s, "--exposure", 1)):
         if value is not None and not 0 < value < limit:
             raise UsageError(f"{option} must be above 0 and below {limit:g} (got {value:g})", "use hertz and seconds")
@@ -252,7 +251,7 @@ def shutter(
     raw = chosen[0].mosaic is not None  # its rows are the sensor's
     along: Any = "rows" if raw or (screen and axis == "auto") else None if axis == "auto" else axis
     if screen:
-        result = _measure_screen(chosen, screen, along)
+        result = calibrate_slots(chosen, load_profile(screen, ScreenProfile), along)
     else:
         lights, tone_known = [light_of(frame) for frame in chosen], raw or chosen[0].linear
         known_s = chosen[0].metadata.exposure_s if exposure_s is None else exposure_s
@@ -268,25 +267,16 @@ def _frames(paths: list[Path], n: int) -> list[Frame]:
     frames = [frame for path in paths for frame in islice(open_source(path), 0, 5 * n, 5)]
     sizes = sorted({f"{frame.width}x{frame.height}" for frame in frames})
     if len(sizes) > 1:
-        raise UsageError(
-            f"the pictures are of different sizes ({', '.join(sizes)})", "calibrate one readout mode at a time"
-        )
+        reason = f"the pictures are of different sizes ({', '.join(sizes)})"
+        raise UsageError(reason, "calibrate one readout mode at a time")
     return frames
-
-
-def _measure_screen(frames: list[Frame], screen: str, axis: Any = "rows") -> ShutterCalibration:
-    from rxcli.calibrate.slots import calibrate_slots
-
-    return calibrate_slots(frames, load_profile(screen, ScreenProfile), axis)
 
 
 def _mode(result: ShutterCalibration, name: str | None = None) -> ReadoutMode:
     """The readout mode that was measured."""
     if result.axis == "columns":
-        raise UsageError(
-            "the readout runs along the columns: the stored picture was rotated, and profiles hold stored rows",
-            "calibrate with an unrotated picture",
-        )
+        reason = "the readout runs along the columns: the stored picture was rotated, and profiles hold stored rows"
+        raise UsageError(reason, "calibrate with an unrotated picture")
     if name is not None and not NAME.fullmatch(name):
         raise UsageError(f"--mode {name!r} cannot name a mode", _NAME_HINT)
     height, width = result.shape
@@ -339,9 +329,8 @@ def lensfun(path: Path, **given: Any) -> None:
     metadata = replace(frame.metadata, **{key: value for key, value in given.items() if value})
     found = lens_from_database(metadata, frame.width, frame.height)
     at = f" at {metadata.focal_length_mm:g} mm"
-    record, lines = _converted_report(
-        found.lens, found.worst_px, found.camera_name, found.lens_name, at, "lensfun's own"
-    )
+    names = (found.camera_name, found.lens_name, at, "lensfun's own")
+    record, lines = _converted_report(found.lens, found.worst_px, *names)
     wanted.write(record, lines, metadata, lambda profile: with_lens(profile, found.lens, metadata.lens))
 
 
@@ -366,7 +355,9 @@ def gyroflow(path: Path, size: str | None, photo: Path | None, screen: str | Non
     wanted.claim([path, *([photo] if photo else [])], "camera", "lens", "camera_matrix", screen=screen)
     width_height: Any = None if size is None else _integers("--size", size, "[xX]", "3840x2160")
     found = load_gyroflow(path, width_height)
-    measured = _measure_screen(_frames([photo], 8), screen) if photo and screen else None
+    measured = None
+    if photo and screen:
+        measured = calibrate_slots(_frames([photo], 8), load_profile(screen, ScreenProfile))
     notes = [*found.notes, *([_agreement(found.readout_s, measured.readout_s)] if measured else [])]
 
     def extended(profile: CameraProfile) -> CameraProfile:

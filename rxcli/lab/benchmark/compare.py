@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -139,9 +140,8 @@ def _decoded_by(checkout: Path, jobs: Sequence[Sequence[str]]) -> list[Record]:
     environment = {**os.environ, **_ENVIRONMENT, "PYTHONPATH": str(checkout)}
     command = [sys.executable, "-P", "-c", _WORKER]
     # Elsewhere: python would look into the folder that it stands in first.
-    done = subprocess.run(
-        command, input=json.dumps(jobs), env=environment, capture_output=True, text=True, check=False, cwd="/"
-    )
+    run = partial(subprocess.run, env=environment, capture_output=True, text=True, check=False, cwd="/")
+    done = run(command, input=json.dumps(jobs))
     if done.returncode:
         reason = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
         raise ReceiverError(f"{checkout}: decoding broke off ({reason[0]})", "run its own tests")

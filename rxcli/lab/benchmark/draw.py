@@ -84,13 +84,10 @@ def draw_phone(at: Place) -> Iterator[Case]:
     scene, turned = phone_of(at.seed, at.number)
     trial = simulate_trial(scene, FIRST_SEED + at.number, oracle=at.oracle)
     frame, corners = as_stored(trial, turned)
-    kinds = {
-        "corrected" if scene.isp.correct_distortion else "uncorrected": True,
-        "below 3 rows a slot": scene.rows_per_slot < 3,
-        "exposed above 1.4 slots": scene.exposure_s * scene.screen.slot_rate_hz > 1.4,
-        "star field": scene.picture == "hubble",
-    }
-    groups = [name for name, is_so in kinds.items() if is_so]
+    groups = ["corrected" if scene.isp.correct_distortion else "uncorrected"]
+    groups += ["below 3 rows a slot"] * (scene.rows_per_slot < 3)
+    groups += ["exposed above 1.4 slots"] * (scene.exposure_s * scene.screen.slot_rate_hz > 1.4)
+    groups += ["star field"] * (scene.picture == "hubble")
     case = _case(trial, ReceiverOptions(cameras=(), corners=corners), *groups, turned=turned)
     yield replace(case, source=(frame,), corners=corners)
 
@@ -342,10 +339,10 @@ def draw_clips(at: Place) -> Iterator[Case]:
     named = bool(rng.random() >= _UNNAMED)
     kinds = "dark pictures" if dark else "photographs", "from a hand" if hand_px else "from a tripod"
     groups = name, *kinds, "camera named" if named else "camera unknown"
-    encodings = [
-        (str(rng.choice(_CODECS)), str(rng.choice(_ENCODER_PRESETS)), _bit_rate(rng, scene, _ANY_BITS_PER_PIXEL))
-        for _ in range(_ENCODINGS)
-    ]
+    encodings = []
+    for _ in range(_ENCODINGS):
+        codec, speed = str(rng.choice(_CODECS)), str(rng.choice(_ENCODER_PRESETS))
+        encodings.append((codec, speed, _bit_rate(rng, scene, _ANY_BITS_PER_PIXEL)))
     recording = prepare(scene, at.flat)
     with filmed(recording, encodings) as paths:
         for path, (codec, _, _) in zip(paths, encodings, strict=True):

@@ -92,10 +92,8 @@ class Group:
 
     def changed(self) -> int:
         """Packets that the first way reported and this one did not, or the other way round."""
-        return sum(
-            len(reported_payloads(case["ways"][self.reference]) ^ reported_payloads(case["ways"][self.way]))
-            for case in self.cases
-        )
+        ways = ([reported_payloads(case["ways"][way]) for case in self.cases] for way in (self.reference, self.way))
+        return sum(len(before ^ after) for before, after in zip(*ways, strict=True))
 
     def shown(self) -> list[Record]:
         """Receptions of screens that can be found: the way beside gave packets."""

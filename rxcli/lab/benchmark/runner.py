@@ -149,10 +149,8 @@ class Run:
         done = load_journal(self.journal)
         missing = {key: task for key, task in keys.items() if key not in done}
         n_done = len(keys) - len(missing)
-        with (
-            tqdm(total=len(keys), initial=n_done, desc=label, disable=self.quiet or None, leave=False) as bar,
-            self.journal.open("a", encoding="utf-8") as file,
-        ):
+        progress = tqdm(total=len(keys), initial=n_done, desc=label, disable=self.quiet or None, leave=False)
+        with progress as bar, self.journal.open("a", encoding="utf-8") as file:
             for key, records in self._each(missing, alone, work):
                 done[key] = records
                 file.write(json.dumps({"key": key, "records": records}, separators=(",", ":")) + "\n")
@@ -165,13 +163,9 @@ class Run:
             for key, task in tasks.items():
                 yield key, work(task)
             return
-        # Libraries read these when they are loaded, which in a spawned worker is later than here.
-        context = get_context("spawn")
-        limit = 1 if alone else None
-        with (
-            environment(ONE_THREAD),
-            ProcessPoolExecutor(self.jobs, context, max_tasks_per_child=limit) as pool,
-        ):
+        # Libraries read the environment when they are loaded, which in a spawned worker is later than here.
+        workers = ProcessPoolExecutor(self.jobs, get_context("spawn"), max_tasks_per_child=1 if alone else None)
+        with environment(ONE_THREAD), workers as pool:
             futures = {pool.submit(work, task): key for key, task in tasks.items()}
             try:
                 for future in as_completed(futures):

@@ -9,18 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli import protocol
 from rxcli.lab.benchmark.trial import SOURCE, Trial, corners_on_picture
 from rxcli.profiles import ScreenProfile
-from rxcli.protocol import (
-    HEADER,
-    PREAMBLE_SLOTS,
-    SLOTS_PER_SYMBOL,
-    WEIGHTS,
-    bits_to_hex,
-    codebook,
-    indices_to_bits,
-    payload_bits,
-)
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, codebook, payload_bits
 from rxcli.results.undistort import undistorted
 from rxcli.types import ColumnResult, FloatArray, FrameResult, Lens, PacketResult
 
@@ -98,10 +90,8 @@ def _between_headers(lit: NDArray[np.bool_], rows_per_slot: float, screen: Scree
     """Packets between headers one packet length apart: the pair that agrees best, and those in step with it."""
     starts, agreement = find_headers(lit, rows_per_slot)
     length = screen.packet_slots * rows_per_slot
-    begin, end = np.meshgrid(np.arange(starts.size), np.arange(starts.size), indexing="ij")
-    begin, end = (
-        side[np.abs(starts[end] - starts[begin] - length) <= _LENGTH_TOLERANCE * length] for side in (begin, end)
-    )
+    distance = starts - starts[:, None]
+    begin, end = np.nonzero(np.abs(distance - length) <= _LENGTH_TOLERANCE * length)
     if begin.size == 0:
         return
     best = starts[begin[(agreement[begin] + agreement[end]).argmax()]]
@@ -144,14 +134,14 @@ def _nearest_packet(slots: NDArray[np.uint8], payload_symbols: int) -> PacketRes
 
 
 def _packet(index: NDArray[np.int64], w: int) -> PacketResult:
-    payload = bits_to_hex(indices_to_bits(index, w))
+    payload = protocol.bits_to_hex(protocol.indices_to_bits(index, w))
     # A yardstick claims nothing of its decisions.
     return PacketResult(0.0, 1.0, payload_bits(w, index.size), payload, confidence=0.0, ber_hat=0.0)
 
 
 def _result(columns: Sequence[tuple[int | None, tuple[PacketResult, ...]]]) -> FrameResult:
-    results = (
+    results = [
         ColumnResult(column, "ok" if packets else "no_packet", w=w, packets=packets, message="none found")
         for column, (w, packets) in enumerate(columns)
-    )
+    ]
     return FrameResult(SOURCE, 0, 0.0, "ok", columns=tuple(results))

@@ -99,10 +99,8 @@ class Exposure:
         first_slot = int(np.floor(starts[0] - self.delays.max())) - 1
         last_slot = int(np.ceil(starts[-1] + self.exposure_slots - self.delays.min())) + 1
         slots = self.link.slots(first_slot, last_slot)
-        shares = [
-            lit_share(s, starts - delay - first_slot, self.exposure_slots)
-            for s, delay in zip(slots, self.delays, strict=True)
-        ]
+        delayed = zip(slots, starts - self.delays[:, None] - first_slot, strict=True)
+        shares = [lit_share(column, start, self.exposure_slots) for column, start in delayed]
         return np.stack(shares, axis=1)
 
     @cached_property

@@ -44,9 +44,8 @@ class HandMotion:
         shape = (4, _WAVES)
         frequency = np.concatenate([low * (high / low) ** rng.random(shape) for low, high in (_SWAY_HZ, _TREMOR_HZ)], 1)
         phase = rng.uniform(0, 2 * np.pi, frequency.shape)
-        rate = (
-            self.speed / _MEAN_LENGTH * np.array([1, 1, _ROLL_SHARE / self.half_width, _ZOOM_SHARE / self.half_width])
-        )
+        shares = np.array([1, 1, _ROLL_SHARE / self.half_width, _ZOOM_SHARE / self.half_width])
+        rate = self.speed / _MEAN_LENGTH * shares
         # Waves of equal speed, whose powers add up.
         amplitude = rate[:, None] * np.sqrt(2 / frequency.shape[1]) / (2 * np.pi * frequency)
         return frequency, phase, amplitude

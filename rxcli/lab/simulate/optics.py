@@ -133,9 +133,8 @@ class View:
     def camera_matrix(self) -> FloatArray:
         """(3, 3) pinhole camera matrix, pixels."""
         focal = self.lens.focal_widths * self.width
-        return np.array(
-            [[focal, 0, (self.width - 1) / 2], [0, focal / self.pixel_aspect, (self.height - 1) / 2], [0, 0, 1.0]]
-        )
+        x, y = (self.width - 1) / 2, (self.height - 1) / 2
+        return np.array([[focal, 0, x], [0, focal / self.pixel_aspect, y], [0, 0, 1.0]])
 
     @cached_property
     def coefficients(self) -> FloatArray:
@@ -151,9 +150,8 @@ class View:
         size = np.array([self.screen.width_mm, self.screen.height_mm])
         matrix = self.camera_matrix
         distance = matrix[0, 0] * size[0] / (self.pose.fill * self.width)
-        shift = np.array(
-            [self.pose.shift_x * self.width / matrix[0, 0], self.pose.shift_y * self.height / matrix[1, 1]]
-        )
+        shift_px = np.array([self.pose.shift_x * self.width, self.pose.shift_y * self.height])
+        shift = shift_px / matrix[[0, 1], [0, 1]]
         axes = rotation(self.pose.roll_deg, self.pose.yaw_deg, self.pose.pitch_deg)[:, :2] * size
         centre = np.append(shift * distance, distance) - axes.sum(axis=1) / 2
         return np.column_stack([axes, centre])
