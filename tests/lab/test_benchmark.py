@@ -54,15 +54,6 @@ def test_bound_and_paper_read_an_easy_frame(easy: Trial) -> None:
     assert scores["paper"]["error_free"] > 0.5 * scores["paper"]["expected"]
 
 
-def test_the_bound_is_no_magic(easy: Trial) -> None:
-    dark = replace(easy.capture.scene, light_e_per_s=easy.capture.scene.light_e_per_s * 1e-4)
-    case = case_of(simulate_trial(dark, 3, oracle=True))
-    score = Group([{"ways": {"bound": received(case, "bound")}}], "bound", "")
-    assert score.score.ber is not None
-    assert score.score.ber > 0.25
-    assert received(case, "paper")["score"]["error_free"] == 0
-
-
 @pytest.mark.parametrize("output", ["raw", "developed"])
 def test_a_picture_without_its_first_row_gives_the_same_packets(easy: Trial, output: Any) -> None:
     case = case_of(simulate_trial(replace(easy.capture.scene, output=output), 3))
@@ -329,17 +320,17 @@ def test_mistakes_are_told(arguments: list[str], message: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "now", "difference"),
+    ("after", "difference"),
     [
-        ([{"a": [1, 2.5]}], [{"a": [1, 2.5]}], None),
-        ([{"a": [1, 2.5]}], [{"a": [1, 2.5000001]}], "[0].a[1]: 2.5 -> 2.5000001"),
-        ([{"a": 1}], [{"a": 1, "b": 2}], "[0].b: null -> 2"),
-        ([{"a": [1]}], [{"a": [1, 2]}], "[0].a: [1] -> [1, 2]"),
-        ([{"a": 1}], [{"a": True}], "[0].a: 1 -> true"),
+        ({"a": [1, 2.5]}, None),
+        ({"a": [1, 2.5000001]}, "[0].a[1]: 2.5 -> 2.5000001"),
+        ({"a": [1, 2.5], "b": 2}, "[0].b: null -> 2"),
+        ({"a": [1]}, "[0].a: [1, 2.5] -> [1]"),
+        ({"a": [True, 2.5]}, "[0].a[0]: 1 -> true"),
     ],
 )
-def test_the_first_difference_is_named(before: list[Any], now: list[Any], difference: str | None) -> None:
-    assert next(compare.differences("", before, now), None) == difference
+def test_the_first_difference_is_named(after: Any, difference: str | None) -> None:
+    assert next(compare.differences("", [{"a": [1, 2.5]}], [after]), None) == difference
 
 
 def test_a_checkout_that_breaks_off_is_told(tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -54,15 +53,6 @@ def test_seeds_of_published_figures_draw_the_scenes_of_old() -> None:
     screen, kind = screen_of(60613, 1)
     assert (kind, screen.screen.name) == ("night", "paper-34k6")
     assert (screen.pose.shift_x, screen.blur_px) == pytest.approx((0.009276227773983495, 1.4390870244467169))
-
-
-def test_a_turned_picture_has_its_corners_turned() -> None:
-    pixels = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    corners = np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 2.0], [0.0, 2.0]])
-    trial: Any = SimpleNamespace(capture=SimpleNamespace(pixels=pixels), corners=corners)
-    frame, turned = draw.as_stored(trial, True)
-    assert frame.pixels[0, 0] == 11
-    np.testing.assert_allclose(turned[0], [3, 2])
 
 
 def test_screens_lie_in_the_picture_and_are_dark_half_of_the_time() -> None:
