@@ -6,7 +6,10 @@ from dataclasses import replace
 
 import msgspec
 
+from rxcli.lab.benchmark.trial import Trial
 from rxcli.lab.simulate.scenes import Scene, preset
+from rxcli.options import ReceiverOptions
+from rxcli.receiver.pipeline import receive
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import FrameResult
 
@@ -49,3 +52,8 @@ def scored(result: FrameResult, truth: Truth) -> tuple[FrameResult, Score]:
     """A result with wrong bits filled in, and its score; the truth holds one frame, numbered 0."""
     scorer = Scorer(truth)
     return scorer.add(replace(result, frame=0)), scorer.score()
+
+
+def reception(trial: Trial, options: ReceiverOptions) -> tuple[FrameResult, Score]:
+    """The scored result of a trial's frame."""
+    return scored(next(iter(receive([trial.frame], options))), trial.truth)

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from small_scene import reception
 
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.capture import Capture, simulate_frame
@@ -430,9 +431,9 @@ def test_rows_that_developing_mixes_are_told_from_the_light(monkeypatch: pytest.
     light = scene.light_e_per_s * scene.exposure_s / exposure_s
     scene = replace(scene, exposure_s=exposure_s, light_e_per_s=light, picture="coffee", n_frames=1)
     trials = [simulate_trial(scene, seed) for seed in range(3)]
-    mixed = [trial.receive(trial.options(cae="never"))[1] for trial in trials]
+    mixed = [reception(trial, trial.options(cae="never"))[1] for trial in trials]
     monkeypatch.setattr(still, "STILL", replace(still.STILL, mixed_rows=0.0))
-    nominal = [trial.receive(trial.options(cae="never"))[1] for trial in trials]
+    nominal = [reception(trial, trial.options(cae="never"))[1] for trial in trials]
     assert sum(score.expected for score in mixed) == 60
     assert sum(score.error_free for score in mixed) >= 40
     # One in twenty may be wrong of packets that are as sure as that.

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from small_scene import reception
 
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.capture import prepare
@@ -58,7 +59,7 @@ class Alike:
 def test_a_screen_that_says_the_same_in_all_columns_is_received(screen: str) -> None:
     scene = preset("phone-plain", screen).scaled(0.3, 0.5, keep_readout=True)
     trial = simulate_trial(replace(scene, labels=Alike(), picture="coffee"), 3)
-    result, score = trial.receive(trial.options())
+    result, score = reception(trial, trial.options())
     assert result.status == "ok"
     assert score.error_free >= 18
     # Two may be wrong, each in its own way.

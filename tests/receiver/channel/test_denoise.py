@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_scene import scored
+from small_scene import reception
 
 from rxcli.errors import ProfileError
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
@@ -23,7 +23,6 @@ from rxcli.receiver.channel import denoise, metrics_of
 from rxcli.receiver.channel.denoise import COLUMN_FEATURES, STRIP_FEATURES, DenoiserInput, load_denoiser, network_inputs
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
-from rxcli.receiver.pipeline import receive
 from rxcli.receiver.search import search
 from rxcli.resources import data_dir
 from rxcli.results.truth import Score
@@ -411,7 +410,7 @@ def packets(result: FrameResult) -> list[str]:
 
 
 def received(trial: Trial, mode: str) -> tuple[FrameResult, Score]:
-    return scored(next(iter(receive([trial.frame], trial.options(cae=mode)))), trial.truth)
+    return reception(trial, trial.options(cae=mode))
 
 
 def test_a_clean_frame_goes_without(trials: dict[str, Trial]) -> None:
