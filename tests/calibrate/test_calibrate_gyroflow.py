@@ -12,7 +12,7 @@ import pytest
 
 from rxcli.calibrate.gyroflow import load_gyroflow
 from rxcli.cli.main import run
-from rxcli.errors import InputError, ProfileError
+from rxcli.errors import ExitCode, InputError, ProfileError
 from rxcli.profiles import CameraProfile, load_profile
 
 PROFILE: dict[str, Any] = {
@@ -115,6 +115,7 @@ def test_the_lens_is_written_and_a_wrong_hint_is_told_by_a_picture(
     profile = load_profile(str(tmp_path / "cam.toml"), CameraProfile)
     assert (profile.make, profile.models, profile.modes) == ("Maker", ("M 1",), ())
     assert profile.lens is not None
+    assert run([*arguments, "--photo", str(sample)]) == ExitCode.USAGE
     assert run([*arguments, "--photo", str(sample), "--screen", "paper-17k3"]) == 0
     assert "% below the picture's (12.7" in capsys.readouterr().out
     [mode] = load_profile(str(tmp_path / "cam.toml"), CameraProfile).modes

@@ -304,11 +304,13 @@ def test_wrong_usage_is_one_line(
 
 def test_refusals_and_unreadable_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     Image.new("L", (200, 200), 99).save(tmp_path / "dull.png")
-    for name, code, reason in [
-        ("dull.png", ExitCode.NOT_RECEIVED, "no stripes"),
-        ("absent.png", ExitCode.UNREADABLE, "absent.png"),
+    Image.new("L", (100, 200), 99).save(tmp_path / "narrow.png")
+    for names, code, reason in [
+        (["dull.png"], ExitCode.NOT_RECEIVED, "no stripes"),
+        (["absent.png"], ExitCode.UNREADABLE, "absent.png"),
+        (["dull.png", "narrow.png"], ExitCode.USAGE, "of different sizes (100x200, 200x200)"),
     ]:
-        assert run(["calibrate", "shutter", str(tmp_path / name), "--frequency", "1000"]) == code
+        assert run(["calibrate", "shutter", *(str(tmp_path / name) for name in names), "--frequency", "1000"]) == code
         assert reason in capsys.readouterr().err
 
 
