@@ -94,6 +94,12 @@ class UsageError(ReceiverError):
     exit_code = ExitCode.USAGE
 
 
+def reason_of(error: BaseException) -> str:
+    """Message of an exception in one short line; of one of the system its text alone."""
+    text = getattr(error, "strerror", None) or " ".join(str(part) for part in error.args) or type(error).__name__
+    return " ".join(str(text).split())[:160]
+
+
 def shortened(text: str, length: int = 80) -> str:
     """`text` cut to a length, so that a message stays one line."""
     return text if len(text) <= length else f"{text[: length - 3]}..."

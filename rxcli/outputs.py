@@ -19,7 +19,7 @@ from pathlib import Path
 from tempfile import mkstemp
 from typing import TYPE_CHECKING
 
-from rxcli.errors import ExitCode, OutputError, ReceiverError, UsageError
+from rxcli.errors import ExitCode, OutputError, ReceiverError, UsageError, reason_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -182,8 +182,8 @@ def _try_to_write(folder: Path) -> None:
 def _refusal(what: str, error: BaseException, step: str) -> ReceiverError:
     """A usage error, or an output error if the disk is to blame."""
     if getattr(error, "errno", None) in _DISK_FAILS:
-        return OutputError(f"{what}: cannot be written ({_reason(error)})", "make room, or name another disk")
-    return UsageError(f"{what}: cannot be written ({_reason(error)})", step)
+        return OutputError(f"{what}: cannot be written ({reason_of(error)})", "make room, or name another disk")
+    return UsageError(f"{what}: cannot be written ({reason_of(error)})", step)
 
 
 def claim_own_folder(option: str, folder: Path, known: Iterable[str] = (), force: bool = False) -> None:
@@ -230,7 +230,7 @@ def _check_place(output: Output) -> None:
         if not output.makes_folder and not path.resolve().parent.is_dir():
             raise UsageError(f"{output}: there is no such folder", "make it, or name another")
     except (OSError, ValueError, RuntimeError) as error:
-        raise UsageError(f"{output}: {_reason(error)}", "name another file") from None
+        raise UsageError(f"{output}: {reason_of(error)}", "name another file") from None
 
 
 def _is_stream(path: Path) -> bool:
@@ -251,7 +251,7 @@ def _check_ours(output: Output) -> None:
     except FileNotFoundError:
         return
     except OSError as error:
-        raise UsageError(f"{output}: cannot be looked at ({_reason(error)})", "name another file") from None
+        raise UsageError(f"{output}: cannot be looked at ({reason_of(error)})", "name another file") from None
     ours = not head or output.ours.search(head)
     if head and ours and output.way_on is not None:
         raise UsageError(f"{output}: holds the results of an earlier run", output.way_on)
@@ -331,15 +331,11 @@ def check_replaceable(path: Path, ours: re.Pattern[bytes], option: str) -> None:
 def unwritable(path: Path, error: BaseException) -> OutputError:
     """Error for a `path` that cannot be written, with the reason; a usage error unless the disk is to blame."""
     refusal = OutputError(
-        f"{path}: cannot be written ({_reason(error)})", "name a file in a folder that can be written"
+        f"{path}: cannot be written ({reason_of(error)})", "name a file in a folder that can be written"
     )
     if isinstance(error, OSError) and error.errno in _NAMED_WRONG:
         refusal.exit_code = ExitCode.USAGE
     return refusal
-
-
-def _reason(error: BaseException) -> str:
-    return getattr(error, "strerror", None) or str(error)
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:

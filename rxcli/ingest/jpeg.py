@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import InputError
-from rxcli.ingest.sniff import check_size, reason_of
+from rxcli.errors import InputError, reason_of
+from rxcli.ingest.sniff import check_size
 
 #: What simplejpeg raises; KeyError for a subsampling that it does not know.
 _FAULTS = (ValueError, KeyError, MemoryError, OverflowError)

@@ -125,16 +125,12 @@ def _raw_metadata(file: BinaryIO) -> Metadata:
         file.seek(offset)
         return jpeg_metadata(file.read(min(length, _HEADER_BYTES)))
     if head[4:8] == b"ftyp":
-        return _canon_metadata(head + file.read(_HEADER_BYTES - HEAD))
+        head += file.read(_HEADER_BYTES - HEAD)
+        found = head.find(b"CMT1")  # the box of IFD0; LibRaw states the exposure
+        return exif_metadata(head[found + 4 :]) if found >= 0 else Metadata()
     if head[:4] in (b"IIRO", b"IIRS", b"IIU\0"):  # TIFF but for the magic number
         return tiff_metadata(io.BytesIO(b"II*\0" + head[4:] + file.read(_HEADER_BYTES - HEAD)))
     return tiff_metadata(file)
-
-
-def _canon_metadata(head: bytes) -> Metadata:
-    """CR3 keeps IFD0 and the EXIF directory as two TIFF blocks in boxes of their own."""
-    main, exif = (head[at + 4 :] if (at := head.find(name)) >= 0 else b"" for name in (b"CMT1", b"CMT2"))
-    return merge(exif_metadata(main), exif_metadata(exif))
 
 
 def _load_directories(stream: BinaryIO) -> tuple[Tags, Tags]:

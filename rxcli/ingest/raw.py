@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import InputError
+from rxcli.errors import InputError, reason_of
 from rxcli.ingest.extent import bytes_claimed, claims_too_much
 from rxcli.ingest.metadata import believed, merge, raw_metadata
 from rxcli.ingest.quiet import quiet_libraries
-from rxcli.ingest.sniff import check_size, reason_of
+from rxcli.ingest.sniff import check_size
 from rxcli.types import Frame, Metadata, Mosaic
 
 #: LibRaw's turns for viewing -> EXIF orientation.

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from rxcli.errors import InputError
+from rxcli.errors import InputError, reason_of
 
 Kind = Literal["jpeg", "png", "tiff", "heif", "other_image", "raw", "video", "device"]
 
@@ -155,9 +155,3 @@ def damage_explained(reason: str, step: str) -> Iterator[None]:
         raise
     except Exception as error:
         raise InputError(f"{reason} ({reason_of(error)})", step) from None
-
-
-def reason_of(error: BaseException) -> str:
-    """Message of an exception in one short line."""
-    text = getattr(error, "strerror", None) or " ".join(str(part) for part in error.args) or type(error).__name__
-    return " ".join(str(text).split())[:160]

@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import InputError
+from rxcli.errors import InputError, reason_of
 from rxcli.ingest.ahead import read_ahead
 from rxcli.ingest.metadata import clip_metadata
 from rxcli.ingest.orientation import orientation_of_turn
-from rxcli.ingest.sniff import check_size, reason_of
+from rxcli.ingest.sniff import check_size
 from rxcli.types import Frame, Metadata
 
 #: ITU-T H.273: samples use 16..235 of 8 bits, or all of them (FFmpeg's AVCOL_RANGE_JPEG).

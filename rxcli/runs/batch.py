@@ -19,7 +19,7 @@ from queue import SimpleQueue
 from threading import Lock, Semaphore, Thread, local
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError
+from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError, reason_of
 from rxcli.ingest import open_source
 from rxcli.link.collector import Collector
 from rxcli.options import ReceiverOptions
@@ -216,7 +216,7 @@ def _problem(error: Exception, source: Source) -> str:
     if isinstance(error, ReceiverError):
         return str(error).replace(source.path, source.name)
     if isinstance(error, (OSError, MemoryError)):
-        reason = getattr(error, "strerror", None) or "more memory is needed than there is"
+        reason = "more memory is needed than there is" if isinstance(error, MemoryError) else reason_of(error)
         return f"{source.name}: cannot be decoded ({reason}); try it by itself"
     log.debug("unexpected error", exc_info=error)
     return f"internal error ({type(error).__name__}: {error}); run again with --verbose and report it"
