@@ -41,19 +41,12 @@ def test_codebook_holds_the_smallest_words_in_order(w: int) -> None:
         protocol.codebook(w)[0, 0] = 1
 
 
-def test_header_and_dimming_symbols() -> None:
-    assert list(protocol.HEADER) == word("0011100011")
-    assert [protocol.dimming_symbol(w).tolist() for w in (1, 5, 9)] == [
-        word("1000000000"),
-        word("1111100000"),
-        word("1111111110"),
-    ]
-
-
 def test_a_packet_written_by_hand() -> None:
     bits = np.array(word("000000000000011111111"), np.uint8)
     slots = "00111000111111100000000001111100001011111000010111"
     assert protocol.encode_packet(bits, 5).tolist() == word(slots)
+    dimming = {1: "1000000000", 5: "1111100000", 9: "1111111110"}
+    assert {w: protocol.dimming_symbol(w).tolist() for w in dimming} == {w: word(text) for w, text in dimming.items()}
 
 
 @pytest.mark.parametrize(

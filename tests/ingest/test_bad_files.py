@@ -12,7 +12,6 @@ import zlib
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
-from types import SimpleNamespace
 
 import av
 import cv2
@@ -26,7 +25,6 @@ from PIL import Image
 
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode
-from rxcli.ingest import video
 from rxcli.ingest.sniff import check_size
 
 NOISE = np.random.default_rng(7).integers(0, 255, (64, 96), dtype=np.uint8)
@@ -235,15 +233,6 @@ def test_a_cut_transport_stream_says_so(tmp_path: Path) -> None:
     frames, error = read_all(path)
     assert 0 < len(frames) < len(whole)
     assert "breaks off" in str(error)
-
-
-def test_times_of_years_are_not_believed() -> None:
-    codec = SimpleNamespace(framerate=Fraction(30))
-    stream = SimpleNamespace(time_base=Fraction(1, 30), codec_context=codec, guessed_rate=None, average_rate=None)
-    progress = video._Progress()
-    found = [video._time_s(SimpleNamespace(pts=pts), stream, progress) for pts in (60, 90, 1 << 60, -(1 << 60))]
-    assert [nominal for _, nominal in found] == [False, False, True, True]
-    assert [time_s for time_s, _ in found] == pytest.approx([2.0, 3.0, 3.0 + 1 / 30, 3.0 + 2 / 30])
 
 
 @pytest.mark.parametrize("first_s", [0, 2_000_000], ids=["later", "at once"])

@@ -104,16 +104,6 @@ def test_messages_of_every_length(length: int, symbols: int) -> None:
     assert contents(events) == ["x" * length]
 
 
-def test_ten_columns_in_the_dark_leave_a_text_of_32_bytes_in_one_photo() -> None:
-    rng = np.random.default_rng(5)
-    dark = tuple(-np.inf if c % 2 else 14.0 for c in range(COLUMNS))
-    for symbols in (24, 11):
-        sending = message("m" * 31)
-        llr = detect(sending.labels(np.arange(1), COLUMNS, symbols), 5, dark, rng)
-        receiver = LinkReceiver(COLUMNS, symbols)
-        assert contents(receiver.add(FrameSoftBits(np.arange(1), llr))) == ["m" * 31]
-
-
 def test_photos_of_one_beacon_are_combined() -> None:
     rng = np.random.default_rng(6)
     sending, receiver = message("z" * 150), LinkReceiver(COLUMNS, 11)

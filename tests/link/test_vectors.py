@@ -15,7 +15,7 @@ from rxcli.link import ldpc
 from rxcli.link.encoder import FileSending, MessageSending, file_object, message
 from rxcli.link.formats import Announcement, pack_parts, protect, unprotect_announcement
 from rxcli.link.layout import announcement_layout, beacon_layout
-from rxcli.link.sequences import splitmix64_stream, whiten
+from rxcli.link.sequences import whiten
 
 VECTORS = json.loads((Path(__file__).parent / "vectors.json").read_text(encoding="utf-8"))
 SCREENS = {"data-34k6": (20, 24), "data-17k3": (20, 11), "data-8k65": (20, 5), "wide-100": (100, 24)}
@@ -25,11 +25,6 @@ def check_labels(labels: np.ndarray, expected: dict[str, Any]) -> None:
     assert list(labels.shape) == expected["shape"]
     assert labels.ravel()[: len(expected["first40"])].tolist() == expected["first40"]
     assert hashlib.sha256(np.ascontiguousarray(labels).tobytes()).hexdigest() == expected["sha256"]
-
-
-def test_splitmix64() -> None:
-    expected = VECTORS["splitmix64"]["seed 0, outputs 1..3"]
-    assert [f"{v:016x}" for v in splitmix64_stream(0, 3)] == expected
 
 
 @pytest.mark.parametrize("case", sorted(VECTORS["whitening"]))

@@ -15,7 +15,6 @@ from rxcli.errors import InputError, UsageError
 from rxcli.results.record import to_json_line
 from rxcli.runs.batch import Source, collect_sources, decode_here, decode_in_processes, unreadable
 from rxcli.runs.journal import Head, Journal, Lines
-from rxcli.types import FrameResult
 
 SUFFIXES = frozenset({".jpg", ".mp4"})
 
@@ -118,20 +117,10 @@ def test_wrong_options_end_a_run(tmp_path: Path) -> None:
             lines(decoded)
 
 
-def results_of(names: str) -> list[FrameResult]:
-    """One frame per letter, numbered within the source that the letter names."""
-    counts: dict[str, int] = {}
-    found = []
-    for name in names:
-        found.append(replace(unreadable(Source(name, name), counts.get(name, 0), "why"), status="ok"))
-        counts[name] = counts.get(name, 0) + 1
-    return found
-
-
 def write_journal(path: Path, names: str) -> bytes:
     """A journal of one frame per letter of `names`, of which the decoder of `d` was killed."""
     journal, made = Journal(path), Lines(Head("1", {"cae": "auto"}), {})
-    found = results_of(names)
+    found = [replace(unreadable(Source(name, name), n, "why"), status="ok") for n, name in enumerate(names)]
     for result, following in zip(found, [*found[1:], None], strict=True):
         made.begin(result.source)
         last = following is None or following.source != result.source
