@@ -59,10 +59,7 @@ class Truth(msgspec.Struct, frozen=True, kw_only=True):
     frames: tuple[TruthFrame, ...]
     #: Burst number -> one hex string per column, first bit most significant.
     payload: dict[int, tuple[str, ...]]
-    capture: str = ""
     screen: str | None = None
-    slot_rate_hz: float | None = None
-    repeats: int | None = None
     camera: dict[str, Any] | None = None
 
     @property

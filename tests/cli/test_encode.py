@@ -109,3 +109,9 @@ def test_a_text_comes_first_and_in_json_and_payloads_as_rows(
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert len(rows) == sum(len(column["packets"]) for column in record["columns"])
     assert rows[0]["hex"] == record["columns"][0]["packets"][0]["payload"]
+
+
+def test_it_is_said_that_no_packet_fits_a_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--preset", "video-1080p", "--screen", "paper-8k65", "--fill", "0.2", "--scale", "0.1"]
+    assert run(["simulate", str(tmp_path / "x.png"), *arguments]) == ExitCode.OK
+    assert "no packet fits a frame" in capsys.readouterr().err
