@@ -76,7 +76,7 @@ class FirstOutline:
         if self.settled or self._texture is None:
             return
         moved = self._texture.find(frame)
-        if not moved.tells:
+        if not moved.is_precise:
             moved = self._texture.with_outline(moved, self._first)
         found = search(frame, self._options, Timer(), self._known)
         outline = found.outline

@@ -43,7 +43,7 @@ class TrackedScreen:
         self._first_middles = geometry.column_middles(pose.corners, pose.map.inside.shape[0], lens)
         self._texture = ScreenTexture(frame, pose.corners, lens)
         #: Frames whose picture did not locate the screen, and consecutive outlines equal to the first of them.
-        self._n_untold = self._n_still = 0
+        self._n_imprecise = self._n_still = 0
         #: Looks in a row that found it where it was, and frames since the last one.
         self._n_rested = self._n_unlooked = 0
         self._still_outline: FloatArray | None = None
@@ -93,14 +93,14 @@ class TrackedScreen:
         self._n_unlooked = 0
         found = self._texture.find(frame)
         confirmed = found.fits
-        if not found.tells:
+        if not found.is_precise:
             possible = _is_possible(self._expected - found.corners, found.covariance)
             outline = self._outline_near(frame, self._expected, surprised=not possible)
             confirmed = confirmed or outline is not None or self._named
-            found = self._untold(found, outline)
+            found = self._by_outline(found, outline)
         if not confirmed:
             return False
-        if (found.tells or self._rests) and _is_still(found.corners - self.corners, found.sd_px):
+        if (found.is_precise or self._rests) and _is_still(found.corners - self.corners, found.sd_px):
             found = replace(found, corners=self.corners)
             self._n_rested += 1
         else:
@@ -109,7 +109,7 @@ class TrackedScreen:
         self._texture.learn(frame, found)
         return True
 
-    def _untold(self, found: Registration, outline: FloatArray | None) -> Registration:
+    def _by_outline(self, found: Registration, outline: FloatArray | None) -> Registration:
         """Position of a screen with too little texture: at rest, unless its outline indicates a motion."""
         at_rest = self._texture.with_outline(found, self._expected, SETTINGS.rest_sd)
         if self._rests or _is_possible(self._expected - found.corners, found.covariance):
@@ -143,8 +143,8 @@ class TrackedScreen:
         """
         from rxcli.receiver.screen.find import ColumnLayout, follow_outline
 
-        self._n_untold += 1
-        if self._n_untold % (SETTINGS.look_every if self._n_still >= SETTINGS.still_looks and not surprised else 2):
+        self._n_imprecise += 1
+        if self._n_imprecise % (SETTINGS.look_every if self._n_still >= SETTINGS.still_looks and not surprised else 2):
             return None
         stored, order = _stored_order(corners)
         screen = self._begun_with[0].screen

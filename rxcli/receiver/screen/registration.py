@@ -87,14 +87,9 @@ class Registration:
         return float(np.sqrt(np.trace(self.covariance) / 8))
 
     @property
-    def tells(self) -> bool:
+    def is_precise(self) -> bool:
         """Whether the texture suffices to locate the screen, provided that the picture has not changed."""
         return self.sd_px < _MAX_SD * _size(self.corners)
-
-    @property
-    def certain(self) -> bool:
-        """Whether the screen is certainly at this position."""
-        return self.tells and self.fits
 
     @property
     def fits(self) -> bool:

@@ -50,7 +50,8 @@ def test_a_shift_is_found(shift: tuple[float, float]) -> None:
     panel = texture()
     known = known_of(panel)
     found = known.find(picture_of(panel, CORNERS + np.array(shift), 9))
-    assert found.certain
+    assert found.is_precise
+    assert found.fits
     assert found.corners == pytest.approx(CORNERS + np.array(shift), abs=1.5)
 
 
