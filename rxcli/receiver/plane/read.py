@@ -40,12 +40,16 @@ def read_plane(frame: Frame) -> LightPlane:
 
 def turned(plane: LightPlane) -> LightPlane:
     """The plane of the picture rotated by 90 degrees, in square pixels of a cell's width."""
+    import cv2
+
     cells = np.diff(plane.sums, axis=0)
-    size = plane.cell_px
-    n = cells.shape[1] // size
-    sums = np.zeros((n + 1, cells.shape[0]), np.float32)
-    sums[1:] = cells[:, : n * size].reshape(len(cells), n, size).mean(axis=2).T / np.float32(size)
-    return replace(plane, sums=_run(sums), cell_px=1, width=n)
+    cell_px = max(cells.shape[1] // plane.cell_px // SETTINGS.turned_cells, 1)
+    n = cells.shape[1] // (cell_px * plane.cell_px)
+    rows = cells[:, : n * cell_px * plane.cell_px]
+    sums = np.zeros((n + 1, len(cells)), np.float32)
+    sums[1:] = cv2.resize(rows, (n, len(cells)), interpolation=cv2.INTER_AREA).T
+    sums *= np.float32(cell_px / plane.cell_px)
+    return replace(plane, sums=_run(sums), cell_px=cell_px, width=n * cell_px)
 
 
 def _cell_px(width: int, period: int) -> int:

@@ -11,6 +11,8 @@ class PlaneSettings:
 
     #: Minimum number of cells of a row: several for every strip of a hundred columns.
     min_cells: int = 1500
+    #: Minimum number of cells of a row of a picture rotated by 90 degrees: it is searched for wide columns only.
+    turned_cells: int = 400
     #: Width of a strip in pixels from which a column is divided further, and maximum number of strips of a column.
     strip_px: int = 12
     max_strips: int = 8

@@ -32,11 +32,11 @@ _IN_VIEW = 0.4
 #: that this adds.
 _BEGINS_ODDS, _BEYOND, _ON_BORDER = 2.0, 0.3, 3.0
 #: A film has dark bars beside it. It begins where its level exceeds this share between dark and bright (percentiles
-#: over the columns). The level left over at this distance beside it, the range of its width as shares of the screen's,
-#: and its maximum offset from the screen's middle, columns. Log-odds that a film adds with the usual number of columns;
-#: with more columns it is less likely by chance.
+#: over the columns). The level left over at this distance beside it, its minimum width as a share of the screen's, the
+#: minimum width of its bars together and its maximum offset from the screen's middle, columns. Log-odds that a film adds
+#: with the usual number of columns; with more columns it is less likely by chance.
 _DARK, _BRIGHT, _BEGINS = 5, 75, 0.25
-_LEFT_OVER, _BESIDE, _FILM_WIDTHS, _IN_MIDDLE, _FILM, _USUAL_COLUMNS = 0.12, 0.45, (0.53, 0.95), 0.2, 3.5, 20
+_LEFT_OVER, _BESIDE, _MIN_FILM, _BARS, _IN_MIDDLE, _FILM, _USUAL_COLUMNS = 0.12, 0.45, 0.53, 1.0, 0.2, 3.5, 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +149,7 @@ def first_columns(light: LightProfile, n_columns: int) -> FirstColumns:
 
 def _is_film(light: LightProfile, n_columns: int) -> bool:
     film = light.film
-    return film is not None and _FILM_WIDTHS[0] < (film[1] - film[0]) / n_columns < _FILM_WIDTHS[1]
+    return film is not None and _MIN_FILM * n_columns < film[1] - film[0] < n_columns - _BARS
 
 
 def _hidden(columns: tuple[float, float], reaches: tuple[bool, bool]) -> float:
