@@ -15,15 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.numerics import TINY
-from rxcli.receiver.screen.grid import Grid, columns_at, grid_slopes, grid_step
+from rxcli.receiver.screen.grid import Grid, grid_through
 from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import Float32Array, FloatArray
 
 #: Combs whose pitch and whose position at the picture's ends differ by less lead to the same grid; columns.
 _SAME_PITCH, _SAME_SHAPE = 0.7, 0.8
-#: Gauss-Newton steps from a comb to a grid; precision of a position, columns to the power of minus two.
-_STEPS, _PRECISION = 4, 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,13 +80,10 @@ def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
     raw_x, raw_y, x, y = (values[own].ravel() for values in (strips.raw_x, strips.raw_y, strips.x, strips.y))
     local_x, local_y = (raw_x - raw_x.mean()) * strips.n_parts, raw_y * strips.n_parts
     bent = local_x + comb.turn * local_y + comb.across * local_x**2 + comb.along * local_x * local_y
-    u = comb.phase + comb.pitch * bent
     pitch = comb.pitch * strips.n_parts
     numbers = np.array([comb.phase - pitch * raw_x.mean(), pitch, pitch * comb.turn, 0.0, 0.0, 0.0])
-    for _ in range(_STEPS):
-        off = u - columns_at(numbers, x, y)
-        numbers = numbers + grid_step(numbers, off, np.full(off.shape, _PRECISION), grid_slopes(numbers, x, y))
-    return Grid(numbers, strips.width, strips.height, strips.lens)
+    grid = Grid(numbers, strips.width, strips.height, strips.lens)
+    return grid_through(grid, x, y, comb.phase + comb.pitch * bent)
 
 
 def _distinct(combs: list[Comb], max_combs: int) -> list[Comb]:

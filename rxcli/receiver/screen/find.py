@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import Comb, find_combs, grid_of_comb
-from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_through
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.settings import SETTINGS
@@ -170,10 +170,35 @@ def wide_grid(strips: Strips, sigma: float) -> Grid | None:
     if not combs:
         return None
     best = with_light(some, grid_of_comb(combs[0], strips), sigma)
-    if best.contrast < SETTINGS.plain_contrast * best.explained:
+    is_plain = best.contrast > SETTINGS.plain_contrast * best.explained
+    if not is_plain:
         rest = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
-        best = max([best, *rest], key=lambda grid: grid.explained + SETTINGS.contrast_weight * grid.contrast)
-    return _settled(strips, moved_by_waveforms(some, best, sigma, SETTINGS.first_steps), sigma)
+        best = max([best, *rest], key=_score)
+    best = moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)
+    grids = [best] if is_plain else [best, _slipped(some, best, sigma)]
+    settled = [grid for start in grids if (grid := _settled(strips, start, sigma)) is not None]
+    return max(settled, key=_score, default=None)
+
+
+def _score(grid: Grid) -> float:
+    """Log-likelihood by which grids are compared."""
+    return grid.explained + SETTINGS.contrast_weight * grid.contrast
+
+
+def _slipped(strips: Strips, grid: Grid, sigma: float) -> Grid:
+    """The best grid that is a column off the given one at one end and right at the other.
+
+    Where light is faint at an end of the picture, the columns there may be counted wrong.
+    """
+    x, y = strips.x.ravel(), strips.y.ravel()
+    u = columns_at(grid.numbers, x, y)
+    along, down = 0.5 + strips.raw_x.ravel(), 0.5 + strips.raw_y.ravel() * strips.width / strips.height
+    grids = []
+    for bend in (np.square(1 - along), np.square(along), down):
+        for shift in (-bend, bend):
+            moved = moved_by_waveforms(strips, grid_through(grid, x, y, u + shift), sigma, SETTINGS.slip_steps)
+            grids.append(with_light(strips, moved, sigma))
+    return max(grids, key=_score)
 
 
 def narrow_grid(strips: Strips, sigma: float) -> Grid | None:

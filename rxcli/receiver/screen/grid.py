@@ -17,6 +17,8 @@ from rxcli.receiver.screen.strips import flat_places
 from rxcli.types import FloatArray, Lens
 
 _INVERSE_STEPS = 12
+#: Gauss-Newton steps to a grid through given columns; precision of these, columns to the power of minus two.
+_STEPS, _PRECISION = 4, 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +90,15 @@ def grid_between(corners: FloatArray, n_columns: int, size: tuple[int, int], len
     across, below = n_columns * matrix[0] / matrix[2, 2], matrix[2] / matrix[2, 2]
     u0, g, h = across[2], below[0], below[1]
     return Grid(np.array([u0, across[0] - u0 * g, across[1] - u0 * h, g, h, 0.0]), width, height, lens)
+
+
+def grid_through(grid: Grid, x: FloatArray, y: FloatArray, u: FloatArray) -> Grid:
+    """The grid nearest to columns `u` (n,) at (n,) offsets from the picture's middle; `grid` is the start."""
+    numbers = grid.numbers
+    for _ in range(_STEPS):
+        off = u - columns_at(numbers, x, y)
+        numbers = numbers + grid_step(numbers, off, np.full(off.shape, _PRECISION), grid_slopes(numbers, x, y))
+    return replace(grid, numbers=numbers)
 
 
 def columns_at(numbers: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:

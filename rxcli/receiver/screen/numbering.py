@@ -33,8 +33,8 @@ _IN_VIEW = 0.4
 _BEGINS_ODDS, _BEYOND, _ON_BORDER = 2.0, 0.3, 3.0
 #: A film has dark bars beside it. It begins where its level exceeds this share between dark and bright (percentiles
 #: over the columns). The level left over at this distance beside it, its minimum width as a share of the screen's, the
-#: minimum width of its bars together and its maximum offset from the screen's middle, columns. Log-odds that a film adds
-#: with the usual number of columns; with more columns it is less likely by chance.
+#: minimum width of its bars together and its maximum offset from the screen's middle, columns. Log-odds that a film
+#: adds with the usual number of columns; with more columns it is less likely by chance.
 _DARK, _BRIGHT, _BEGINS = 5, 75, 0.25
 _LEFT_OVER, _BESIDE, _MIN_FILM, _BARS, _IN_MIDDLE, _FILM, _USUAL_COLUMNS = 0.12, 0.45, 0.53, 1.0, 0.2, 3.5, 20
 

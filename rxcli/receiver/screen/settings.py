@@ -71,9 +71,11 @@ class FinderSettings:
     perspective_sd: float = 0.15
     radial_sd: float = 0.004
     #: Weight of the log-likelihood that borders add, relative to that of the light that waveforms explain.
-    contrast_weight: float = 3.0
-    #: Steps on every second window, steps of narrow columns at each reach, and last steps on all windows.
+    contrast_weight: float = 1.5
+    #: Steps on every second window, of a grid with one end slipped by a column, of narrow columns at each reach, and
+    #: last steps on all windows.
     first_steps: int = 3
+    slip_steps: int = 2
     narrow_steps: int = 4
     last_steps: int = 2
     #: Factor by which the followed width of a grid of narrow columns grows at a time.

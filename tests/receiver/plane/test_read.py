@@ -52,14 +52,14 @@ def test_pixels_that_do_not_lie_side_by_side_are_read_alike() -> None:
     np.testing.assert_array_equal(read_plane(mirrored).sums, read_plane(same).sums)
 
 
-@pytest.mark.parametrize("width", [300, 3600])
-def test_a_turned_plane_is_that_of_the_turned_picture(width: int) -> None:
-    light = np.repeat(np.repeat(np.random.default_rng(1).integers(0, 255, (30, width // 4), np.uint8), 4, 0), 4, 1)
-    plane = turned(read_plane(Frame(light, "memory")))
-    size = read_plane(Frame(light, "memory")).cell_px
-    expected = light[::size, ::size].T
-    assert (plane.height, plane.width, plane.cell_px) == (*expected.shape, 1)
-    np.testing.assert_allclose(np.diff(plane.sums, axis=0).T, expected, atol=0.01)
+@pytest.mark.parametrize(("width", "height", "cell_px"), [(300, 30, 1), (3600, 2406, 3)])
+def test_a_turned_plane_is_that_of_the_turned_picture(width: int, height: int, cell_px: int) -> None:
+    light = np.random.default_rng(1).integers(0, 255, (height, width // 4), np.uint8).repeat(4, axis=1)
+    upright = read_plane(Frame(light, "memory"))
+    plane, size = turned(upright), upright.cell_px
+    assert (plane.height, plane.width, plane.cell_px) == (width // size, height // size, cell_px)
+    expected = light[:, ::size].T.reshape(width // size, -1, cell_px * size).mean(axis=2)
+    np.testing.assert_allclose(np.diff(plane.sums, axis=0).T / cell_px, expected, atol=0.01)
 
 
 @pytest.fixture

@@ -262,6 +262,16 @@ def test_a_film_has_sharp_ends_and_fading_light_has_none() -> None:
     assert start.columns[start.log_odds.argmax()] == 0
 
 
+@pytest.mark.parametrize("film", [(0.8, 19.2), (0.6, 18.4)])
+def test_narrow_bars_on_both_sides_show_the_first_column(film: tuple[float, float]) -> None:
+    place = (np.arange(-16, 22 * 8) + 0.5) / 8
+    light = np.where((place > 1.5) & (place < 18.5), 2.0, 0.0)
+    start = first_columns(LightProfile(place, np.ones(place.size, bool), light, film), 20)
+    in_doubt = (start.log_odds > start.log_odds.max() - 2).sum() > 1
+    assert start.columns[start.log_odds.argmax()] == 0 or in_doubt
+    assert in_doubt == (sum(film) != 20)
+
+
 def test_light_ends_where_bars_begin_and_takes_no_more_than_a_screen() -> None:
     v = (np.arange(320) + 0.5) / 320 * 2.2 - 0.6
     rng = np.random.default_rng(1)
