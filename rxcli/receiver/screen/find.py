@@ -175,9 +175,9 @@ def wide_grid(strips: Strips, sigma: float) -> Grid | None:
         rest = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
         best = max([best, *rest], key=_score)
     best = moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)
-    grids = [best] if is_plain else [best, _slipped(some, best, sigma)]
-    settled = [grid for start in grids if (grid := _settled(strips, start, sigma)) is not None]
-    return max(settled, key=_score, default=None)
+    if not is_plain:
+        best = _slipped(some, best, sigma)
+    return _settled(strips, best, sigma)
 
 
 def _score(grid: Grid) -> float:
@@ -186,18 +186,18 @@ def _score(grid: Grid) -> float:
 
 
 def _slipped(strips: Strips, grid: Grid, sigma: float) -> Grid:
-    """The best grid that is a column off the given one at one end and right at the other.
+    """A grid, or a better one that is a column off at one end and agrees at the other.
 
     Where light is faint at an end of the picture, the columns there may be counted wrong.
     """
-    x, y = strips.x.ravel(), strips.y.ravel()
+    some = strips.blocks(slice(None, None, 2))
+    x, y = some.x.ravel(), some.y.ravel()
     u = columns_at(grid.numbers, x, y)
-    along, down = 0.5 + strips.raw_x.ravel(), 0.5 + strips.raw_y.ravel() * strips.width / strips.height
-    grids = []
-    for bend in (np.square(1 - along), np.square(along), down):
+    grids = [with_light(some, grid, sigma)]
+    for bend in (np.square(some.raw_x.ravel() + 0.5), np.square(some.raw_x.ravel() - 0.5)):
         for shift in (-bend, bend):
-            moved = moved_by_waveforms(strips, grid_through(grid, x, y, u + shift), sigma, SETTINGS.slip_steps)
-            grids.append(with_light(strips, moved, sigma))
+            moved = moved_by_waveforms(some, grid_through(grid, x, y, u + shift), sigma, SETTINGS.slip_steps)
+            grids.append(with_light(some, moved, sigma))
     return max(grids, key=_score)
 
 
