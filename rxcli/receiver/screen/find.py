@@ -165,7 +165,7 @@ def follow_outline(plane: LightPlane, corners: FloatArray, layout: ColumnLayout)
 
 def wide_grid(strips: Strips, sigma: float) -> Grid | None:
     """The grid of wide columns that explains the strips' light best, or None."""
-    some = strips.blocks(slice(None, None, 2))
+    some, few = (strips.blocks(slice(None, None, step)) for step in (2, 4))
     combs = _possible_combs(strips, sigma)
     if not combs:
         return None
@@ -175,9 +175,9 @@ def wide_grid(strips: Strips, sigma: float) -> Grid | None:
         rest = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
         best = max([best, *rest], key=_score)
     best = moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)
-    if not is_plain:
-        best = _slipped(some, best, sigma)
-    return _settled(strips, best, sigma)
+    starts = [best] if is_plain else [best, _slipped(few, best, sigma)]
+    settled = [grid for start in starts if (grid := _settled(strips, start, sigma)) is not None]
+    return max(settled, key=_score, default=None)
 
 
 def _score(grid: Grid) -> float:
@@ -186,18 +186,17 @@ def _score(grid: Grid) -> float:
 
 
 def _slipped(strips: Strips, grid: Grid, sigma: float) -> Grid:
-    """A grid, or a better one that is a column off at one end and agrees at the other.
+    """The best grid that differs from the given one by a column at the left or at the right.
 
-    Where light is faint at an end of the picture, the columns there may be counted wrong.
+    Where light is faint at an end, the columns there may be counted wrong.
     """
-    some = strips.blocks(slice(None, None, 2))
-    x, y = some.x.ravel(), some.y.ravel()
+    x, y = strips.x.ravel(), strips.y.ravel()
     u = columns_at(grid.numbers, x, y)
-    grids = [with_light(some, grid, sigma)]
-    for bend in (np.square(some.raw_x.ravel() + 0.5), np.square(some.raw_x.ravel() - 0.5)):
+    grids = []
+    for bend in (np.square(strips.raw_x.ravel() + 0.5), np.square(strips.raw_x.ravel() - 0.5)):
         for shift in (-bend, bend):
-            moved = moved_by_waveforms(some, grid_through(grid, x, y, u + shift), sigma, SETTINGS.slip_steps)
-            grids.append(with_light(some, moved, sigma))
+            moved = moved_by_waveforms(strips, grid_through(grid, x, y, u + shift), sigma, SETTINGS.slip_steps)
+            grids.append(with_light(strips, moved, sigma))
     return max(grids, key=_score)
 
 

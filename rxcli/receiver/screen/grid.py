@@ -17,8 +17,9 @@ from rxcli.receiver.screen.strips import flat_places
 from rxcli.types import FloatArray, Lens
 
 _INVERSE_STEPS = 12
-#: Gauss-Newton steps to a grid through given columns; precision of these, columns to the power of minus two.
-_STEPS, _PRECISION = 4, 100.0
+#: Gauss-Newton steps to a grid through given columns; their spacing, as they lie on a smooth surface; their precision,
+#: columns to the power of minus two.
+_STEPS, _EVERY, _PRECISION = 4, 8, 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +96,7 @@ def grid_between(corners: FloatArray, n_columns: int, size: tuple[int, int], len
 def grid_through(grid: Grid, x: FloatArray, y: FloatArray, u: FloatArray) -> Grid:
     """The grid nearest to columns `u` (n,) at (n,) offsets from the picture's middle; `grid` is the start."""
     numbers = grid.numbers
+    x, y, u = (values[::_EVERY] for values in (x, y, u))
     for _ in range(_STEPS):
         off = u - columns_at(numbers, x, y)
         numbers = numbers + grid_step(numbers, off, np.full(off.shape, _PRECISION), grid_slopes(numbers, x, y))
