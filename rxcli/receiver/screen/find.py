@@ -175,7 +175,7 @@ def wide_grid(strips: Strips, sigma: float) -> Grid | None:
         rest = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
         best = max([best, *rest], key=_score)
     best = moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)
-    starts = [best] if is_plain else [best, _slipped(few, best, sigma)]
+    starts = [best] if is_plain else [best, slipped_grid(few, best, sigma)]
     settled = [grid for start in starts if (grid := _settled(strips, start, sigma)) is not None]
     return max(settled, key=_score, default=None)
 
@@ -185,7 +185,7 @@ def _score(grid: Grid) -> float:
     return grid.explained + SETTINGS.contrast_weight * grid.contrast
 
 
-def _slipped(strips: Strips, grid: Grid, sigma: float) -> Grid:
+def slipped_grid(strips: Strips, grid: Grid, sigma: float) -> Grid:
     """The best grid that differs from the given one by a column at the left or at the right.
 
     Where light is faint at an end, the columns there may be counted wrong.
