@@ -193,8 +193,8 @@ def slipped_grid(strips: Strips, grid: Grid, sigma: float) -> Grid:
     x, y = strips.x.ravel(), strips.y.ravel()
     u = columns_at(grid.numbers, x, y)
     grids = []
-    for bend in (np.square(strips.raw_x.ravel() + 0.5), np.square(strips.raw_x.ravel() - 0.5)):
-        for shift in (-bend, bend):
+    for end_weight in (np.square(strips.raw_x.ravel() + 0.5), np.square(strips.raw_x.ravel() - 0.5)):
+        for shift in (-end_weight, end_weight):
             moved = moved_by_waveforms(strips, grid_through(grid, x, y, u + shift), sigma, SETTINGS.slip_steps)
             grids.append(with_light(strips, moved, sigma))
     return max(grids, key=_score)
