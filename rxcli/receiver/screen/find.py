@@ -28,6 +28,8 @@ from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 BRIGHTEN = "expose longer, raise ISO, or show a brighter picture on the screen"
 #: Parts of a picture that are searched for narrow columns.
 _PARTS = 5
+#: JPEG codes blocks of pixels, whose borders look like those of narrow columns: their width, and its tolerance.
+_BLOCK_PX, _BLOCK_TOLERANCE_PX = 8.0, 0.1
 #: Number of unlit columns at a side from which the side counts as not visible.
 _UNLIT_COLUMNS = 0.5
 
@@ -211,6 +213,8 @@ def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
     for comb in _possible_combs(strips, sigma):
         part = some.blocks(slice(comb.part * n, (comb.part + 1) * n))
         grid = moved_by_waveforms(part, grid_of_comb(comb, strips), sigma, SETTINGS.narrow_steps)
+        if abs(grid.pitch_px - _BLOCK_PX) < _BLOCK_TOLERANCE_PX:
+            continue
         grid = with_light(part, grid, sigma)
         clearness = grid.contrast / max(grid.explained, 1.0)
         if clearness > (best[0] if best else SETTINGS.min_part_contrast):

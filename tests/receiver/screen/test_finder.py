@@ -389,6 +389,13 @@ def test_pictures_without_columns_propose_nothing(name: str) -> None:
     assert why_useless(without_screen(name), 0.0, 255.0) is None
 
 
+def test_blocks_of_a_coder_are_no_columns() -> None:
+    texture = cv2.GaussianBlur(np.random.default_rng(1).normal(0, 1, (720, 960)).astype(np.float32), (0, 0), 1)
+    picture = np.clip(120 + 28 * texture, 0, 255).astype(np.uint8)
+    coded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 10])[1]
+    assert not find_outlines(plane_of(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)), [WIDE, NARROW])
+
+
 @pytest.mark.parametrize(
     ("pixels", "reason"),
     [
