@@ -198,11 +198,13 @@ def _columns(
         status = _column_status(packets, db)
         if not packets and goes_on[column] and not headerless[column]:
             status = "ok"
-        message = _ECHO if any(burst.echo[column] for burst in bursts) else None
-        message = _HEADERLESS if headerless[column] else message or _withheld(confidence, min_confidence)
-        if status == "ok" or not bursts:
+        if packets:
+            message = None
+        elif status == "ok" or not bursts:
             message = _GOES_ON
         else:
+            message = _ECHO if any(burst.echo[column] for burst in bursts) else None
+            message = _HEADERLESS if headerless[column] else message or _withheld(confidence, min_confidence)
             n_observed = np.stack([burst.n_observed[column] for burst in bursts])
             message = _incomplete_reason(n_observed) or message or _light_reason(status, db)
         out.append(
@@ -214,7 +216,7 @@ def _columns(
                 snr_db=db,
                 delay_slots=float(clock.delay_slots[column]),
                 packets=packets,
-                message=None if packets else message,
+                message=message,
             )
         )
     return tuple(out)
@@ -252,8 +254,10 @@ def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> C
 
 def snr_db_of_columns(snr: Float32Array) -> list[float | None]:
     """Median signal-to-noise ratio of each column's visible slots, dB; None where nothing is visible."""
-    median = [float(np.median(column[column > 0])) if (column > 0).any() else None for column in snr]
-    return [None if ratio is None else float(10 * np.log10(max(ratio, TINY))) for ratio in median]
+    brightest_first, n_visible = -np.sort(-snr, axis=1), np.count_nonzero(snr > 0, axis=1)
+    middle = np.take_along_axis(brightest_first, np.stack([(n_visible - 1) // 2, n_visible // 2], axis=1), axis=1)
+    db = 10 * np.log10(np.maximum(middle.mean(axis=1), TINY))
+    return [float(value) if n else None for value, n in zip(db.tolist(), n_visible.tolist(), strict=True)]
 
 
 def all_dark(snr: Float32Array) -> bool:
