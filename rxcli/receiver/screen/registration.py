@@ -104,8 +104,10 @@ class _Known:
     value: Float32Array
     #: Reliability of the texture, 0..1.
     trust: Float32Array
-    #: (8, V, U) change of the texture with the motion of each corner along u, then of each along v.
-    slopes: Float32Array
+    #: (2, V, U) gradient of the texture along u and v, per screen.
+    gradient: Float32Array
+    #: (3, V, U) its products uu, uv and vv.
+    products: Float32Array
 
 
 class ScreenTexture:
@@ -186,7 +188,7 @@ class ScreenTexture:
             plane: corners to begin with.
             expected: corners as predicted.
         """
-        prior = _prior_of_one() / _size(plane) ** 2
+        prior, shares = _prior_of_one() / _size(plane) ** 2, _corner_shares()
         for _ in range(_ITERATIONS):
             value, weight = np.moveaxis(self._read(texture, plane, cell, known.value.shape), 2, 0)
             error, weight = known.value - value, weight * known.trust
@@ -195,9 +197,10 @@ class ScreenTexture:
             # From the corners' motion along u and v to pixels, with the screen approximated by a parallelogram.
             side_u, side_v = plane[1] - plane[0] + plane[2] - plane[3], plane[3] - plane[0] + plane[2] - plane[1]
             to_pixels = np.kron(np.eye(4), np.linalg.inv(np.stack([side_u, side_v], axis=1) / 2))[_BY_AXIS]
-            slopes = known.slopes.reshape(8, -1)
-            normal = to_pixels.T @ ((slopes * weight.ravel()) @ slopes.T) @ to_pixels
-            scores = _sums_of_parts(known.slopes * (weight * error)) @ to_pixels
+            sums = _sums_of_parts(np.concatenate([known.gradient * (weight * error), known.products * weight]))
+            uu, uv, vv = (shares * products @ shares.T for products in sums[2:])
+            normal = to_pixels.T @ np.block([[uu, uv], [uv, vv]]) @ to_pixels
+            scores = (sums[:2, None] * shares).reshape(8, -1).T @ to_pixels
             # The normal matrix is scaled to the information that the scatter of the parts leaves.
             scale = max(float(np.square(scores).sum() / max(np.trace(normal), TINY)), TINY)
             slope = scores.sum(axis=0) / scale + prior @ (expected - plane).ravel()
@@ -274,11 +277,18 @@ def _known_of(texture: Float32Array, n_cells: int) -> _Known:
     for change, n in zip(along, value.shape[::-1], strict=True):
         power = around(change * change * weight) / total
         change *= np.maximum(1 - min_power / np.maximum(power, np.float32(TINY)), 0) * np.float32(n / (1 + 2 * _MARGIN))
-    v, u = (_fractions(n)[:, None] for n in value.shape)
-    corner_v, corner_u = np.array([0, 0, 1, 1]), np.array([0, 1, 1, 0])
-    shares = np.where(corner_v, v, 1 - v).T[:, :, None] * np.where(corner_u, u, 1 - u).T[:, None]
-    slopes = np.asarray(along[:, None] * shares, np.float32).reshape(8, *value.shape)
-    return _Known(value, np.asarray(weight / (weight + 1), np.float32), slopes)
+    gradient = np.asarray(along, np.float32)
+    products = np.stack([gradient[0] ** 2, gradient[0] * gradient[1], gradient[1] ** 2])
+    return _Known(value, np.asarray(weight / (weight + 1), np.float32), gradient, products)
+
+
+@cache
+def _corner_shares() -> FloatArray:
+    """(4, parts) share of each corner's motion in that of the middle of every part of the screen."""
+    v, u = (_fractions(n) for n in _PARTS)
+    return np.stack(
+        [np.outer(down, across).ravel() for down, across in ((1 - v, 1 - u), (1 - v, u), (v, u), (v, 1 - u))]
+    )
 
 
 def _fractions(n: int) -> FloatArray:
@@ -300,11 +310,11 @@ def _positions(n_v: int, n_u: int) -> tuple[FloatArray, Float32Array, Float32Arr
 
 
 def _sums_of_parts(values: Float32Array) -> FloatArray:
-    """(parts, n) sums of values (n, V, U) over the parts of the screen."""
+    """(n, parts) sums of values (n, V, U) over the parts of the screen."""
     n, n_v, n_u = values.shape
     down, across = _PARTS
     parts = values.reshape(n, down, n_v // down, n_u).sum(axis=2).reshape(n, down, across, n_u // across).sum(axis=3)
-    return np.asarray(parts.reshape(n, -1).T, np.float64)
+    return np.asarray(parts.reshape(n, -1), np.float64)
 
 
 def _sandwich(normal: FloatArray, scores: FloatArray, variance: float, prior: FloatArray) -> FloatArray:
