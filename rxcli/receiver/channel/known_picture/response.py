@@ -14,7 +14,7 @@ from rxcli.types import Float32Array, FloatArray, IntArray
 
 #: Approximate number of values from which a response is fitted; and the golden ratio, whose multiples are spread evenly
 #: modulo 1.
-_SAMPLES_OF_RESPONSE, _GOLDEN = 5000, 0.6180339887
+_SAMPLES_OF_RESPONSE, _GOLDEN = 2000, 0.6180339887
 
 
 @dataclass(frozen=True, slots=True)
