@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from rxcli.profiles import ScreenProfile
@@ -126,11 +126,6 @@ class Camera:
             "exposure_s": self.exposure_s,
             "estimated": self.estimated,
         }
-
-    def without_tone_estimate(self) -> Camera:
-        """The camera without its estimated tone curve."""
-        estimated = {name: value for name, value in self.estimated.items() if name != "tone_exponent"}
-        return replace(self, estimated=estimated)
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,15 +35,12 @@ def propose_cameras(
         strips = _strips(context, profiles)
     # A picture does not show the slot rate: the fastest screen represents all with the same packet length.
     screens = sorted(options.screens, key=lambda screen: -screen.slot_rate_hz)
-    found = blind.propose(strips, screens, frame.metadata.exposure_s, may_bend=frame.mosaic is None)
-    while True:
-        with timer("blind"):
-            hypotheses = next(found, None)
-        if hypotheses is None:
-            return Failure("no_signal", blind.why_not(strips))
-        for hypothesis in sorted(hypotheses, key=lambda h: (-h.score, h.rows_per_slot, h.reversed)):
-            screen = next(s for s in screens if s.packet_slots == hypothesis.packet_slots)
-            yield _camera(hypothesis, screen.slot_rate_hz, frame, DEFAULT_TONE)
+    with timer("blind"):
+        hypotheses = blind.propose(strips, screens, frame.metadata.exposure_s)
+    for hypothesis in sorted(hypotheses, key=lambda h: (-h.score, h.rows_per_slot, h.reversed)):
+        screen = next(s for s in screens if s.packet_slots == hypothesis.packet_slots)
+        yield _camera(hypothesis, screen.slot_rate_hz, frame)
+    return Failure("no_signal", blind.why_not(strips))
 
 
 def relabelled_camera(camera: Camera, screen: ScreenProfile, frame: Frame) -> Camera:
@@ -55,7 +52,7 @@ def relabelled_camera(camera: Camera, screen: ScreenProfile, frame: Frame) -> Ca
     if hypothesis.packet_slots != screen.packet_slots:
         exposure_slots = stated or hypothesis.exposure_slots
         hypothesis = replace(hypothesis, packet_slots=screen.packet_slots, exposure_slots=exposure_slots)
-    return _camera(replace(hypothesis, stated_exposure_slots=stated), rate, frame, camera.tone)
+    return _camera(replace(hypothesis, stated_exposure_slots=stated), rate, frame)
 
 
 def settle(context: FrameContext, acquisition: Acquisition, reception: Reception) -> tuple[Camera, float]:
@@ -72,9 +69,8 @@ def settle(context: FrameContext, acquisition: Acquisition, reception: Reception
             clock.on_grid(reception.posteriors.lit),
             screen.light_spread,
             may_bend=frame.mosaic is None,
-            tone=None if frame.mosaic is not None or frame.linear else camera.tone,
         )
-    return _camera(found, screen.slot_rate_hz, frame, camera.tone), moved_slots
+    return _camera(found, screen.slot_rate_hz, frame), moved_slots
 
 
 class InitialPass(Protocol):
@@ -114,14 +110,7 @@ def fitted(best: _Pass, received: Callable[[Camera], _Pass | None]) -> _Pass:
         if candidate is None or candidate.evidence < SETTINGS.kept_evidence * best.evidence:
             break
         best = candidate
-    camera, frame = best.context.camera, best.context.frame
-    if camera.hypothesis is None or not blind.is_linear(camera.hypothesis.tone) or frame.mosaic or frame.linear:
-        return best
-    # The values seem linear; this is accepted if the evidence does not drop.
-    candidate = received(replace(camera, tone="linear"))
-    if candidate is not None and candidate.evidence >= best.evidence:
-        return candidate
-    return best.with_camera(camera.without_tone_estimate())
+    return best
 
 
 def _strips(context: FrameContext, profiles: RowProfiles) -> blind.Strips:
@@ -131,13 +120,13 @@ def _strips(context: FrameContext, profiles: RowProfiles) -> blind.Strips:
     return blind.strips_of(profiles, x[:, ::-1] if context.camera.reversed else x, frame.width, frame.height)
 
 
-def _camera(hypothesis: blind.CameraHypothesis, slot_rate_hz: float, frame: Frame, tone: str) -> Camera:
+def _camera(hypothesis: blind.CameraHypothesis, slot_rate_hz: float, frame: Frame) -> Camera:
     return Camera(
         profile=None,
         line_delay_s=1 / (hypothesis.rows_per_slot * slot_rate_hz),
         exposure_s=hypothesis.exposure_slots / slot_rate_hz,
         lens=blind.lens_of(hypothesis.curvature, frame.width, frame.height),
-        tone=tone,
+        tone=DEFAULT_TONE,
         reversed=hypothesis.reversed,
         estimated=blind.summary(hypothesis, slot_rate_hz),
         hypothesis=hypothesis,

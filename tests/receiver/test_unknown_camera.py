@@ -79,21 +79,19 @@ def _proposed(*rows_per_slot: float) -> list[blind.CameraHypothesis]:
 def _chosen(
     frame: Frame, proposed: Iterable[blind.CameraHypothesis], monkeypatch: pytest.MonkeyPatch
 ) -> Found | Failure:
-    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_, **__: ([one] for one in proposed))
+    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_: list(proposed))
     return search(frame, OPTIONS, Timer())
 
 
 def test_packets_decide_between_hypotheses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, _ = _frame(tmp_path)
     wrong, right, other = _proposed(1.13 * ROWS_PER_SLOT, ROWS_PER_SLOT, 0.7 * ROWS_PER_SLOT)
-    unused = iter([right, other])
-    for proposed in ([wrong, right], [wrong, other, right], unused):
+    for proposed in ([wrong, right], [wrong, other, right], [right, other]):
         found = _chosen(frame, proposed, monkeypatch)
         assert isinstance(found, Found)
         chosen = found.best.hypothesis.camera.hypothesis
         assert chosen is not None
         assert chosen.rows_per_slot == right.rows_per_slot
-    assert next(unused) is other
 
 
 def test_without_packets_there_is_no_camera_but_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,7 +104,7 @@ def test_without_packets_there_is_no_camera_but_a_reason(tmp_path: Path, monkeyp
 
 def test_a_period_that_is_somewhat_off_is_fitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, payloads = _frame(tmp_path)
-    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_, **__: iter([_proposed(1.002 * ROWS_PER_SLOT)]))
+    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_: _proposed(1.002 * ROWS_PER_SLOT))
     result = next(receive([frame], OPTIONS))
     found, sd = result.estimated["rows_per_slot"]
     assert abs(found - ROWS_PER_SLOT) < 4 * sd < 0.01 * ROWS_PER_SLOT
@@ -132,11 +130,9 @@ def _small_phone(tone: Tone) -> tuple[Trial, Frame]:
 
 
 @pytest.mark.parametrize("tone", ["srgb", "linear"])
-def test_the_tone_curve_is_estimated_and_used(tone: Tone) -> None:
+def test_packets_are_received_through_either_tone_curve(tone: Tone) -> None:
     trial, frame = _small_phone(tone)
     options = ReceiverOptions(cameras=(), corners=trial.corners, cae="never")
     result = next(receive([frame], options))
-    exponent, sd = result.estimated["tone_exponent"]
-    assert abs(exponent - (1.0 if tone == "linear" else 2.2)) < 2 * sd
     _, score = scored(result, trial.truth)
     assert score.error_free >= 15

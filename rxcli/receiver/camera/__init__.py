@@ -5,10 +5,8 @@ one to the slots that were decoded with it. docs/blind.md explains both.
 """
 
 from rxcli.receiver.camera.advice import why_not
-from rxcli.receiver.camera.camera import camera_profile, in_time_order, is_linear, lens_of, summary
-from rxcli.receiver.camera.columns import columns_misfit
-from rxcli.receiver.camera.curvature import curvature_terms
-from rxcli.receiver.camera.fit import settle
+from rxcli.receiver.camera.camera import camera_profile, in_time_order, lens_of, summary
+from rxcli.receiver.camera.fit import curvature_terms, settle
 from rxcli.receiver.camera.proposals import CameraHypothesis, propose
 from rxcli.receiver.camera.strips import Strips, strips_of
 
@@ -16,10 +14,8 @@ __all__ = [
     "CameraHypothesis",
     "Strips",
     "camera_profile",
-    "columns_misfit",
     "curvature_terms",
     "in_time_order",
-    "is_linear",
     "lens_of",
     "propose",
     "settle",

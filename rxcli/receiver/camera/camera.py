@@ -8,7 +8,6 @@ import numpy as np
 
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.receiver.camera.proposals import CameraHypothesis
-from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.types import FloatArray, Lens, RowProfiles
 
 _COEFFICIENTS = ("k1", "k2", "p1", "p2")
@@ -58,14 +57,7 @@ def summary(hypothesis: CameraHypothesis, slot_rate_hz: float) -> dict[str, tupl
         out["distortion_corrected"] = (1.0, 0.0)
     if hypothesis.exposure_slots_sd > 0:
         out["exposure_s"] = (hypothesis.exposure_slots / slot_rate_hz, hypothesis.exposure_slots_sd / slot_rate_hz)
-    if hypothesis.tone:
-        out["tone_exponent"] = hypothesis.tone
     return out
-
-
-def is_linear(tone: tuple[float, float] | None) -> bool:
-    """Whether a picture of some exponent is read as one whose values follow light."""
-    return tone is not None and tone[0] < SETTINGS.linear_below
 
 
 def camera_profile(
@@ -110,6 +102,5 @@ def camera_profile(
         models=(model,) if model else (),
         modes=(mode,),
         lens=lens,
-        tone="linear" if is_linear(estimated.get("tone_exponent")) else "auto",
         description=f"estimated from one picture; line delay to {100 * sd / line_delay_s:.2g} %",
     )

@@ -1,4 +1,4 @@
-"""The camera once more, from decoded slots: start, period and bend by least squares, exposure and tone curve.
+"""The camera once more, from decoded slots: start, period and bend by least squares, and exposure.
 
 The slots, as probabilities seen through the exposure, predict the light of every strip on every row. What is missing
 is the derivative with respect to time.
@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.numerics import TINY, local_mean
-from rxcli.receiver.camera.curvature import curvature_terms, reversed_curvature
 from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips, joined
@@ -23,8 +22,6 @@ _BLOCK_ROWS = 16
 #: Inverse covariance of k1 k2 p1 p2 before the picture is seen: lenses bend back further out, k2 is about -k1.
 _PRECISION: FloatArray = np.diag(np.array([0.3, 0.6, 1.5e-3, 1.5e-3]) ** -2.0 * [1, 0, 1, 1])
 _PRECISION[:2, :2] += 0.2**-2
-#: Exponent that makes light of values, as nearly as a power does, by the tone curve that was undone.
-_EXPONENTS = {"srgb": 2.2, "linear": 1.0}
 
 
 def settle(
@@ -35,7 +32,6 @@ def settle(
     light_spread: float,
     *,
     may_bend: bool = True,
-    tone: str | None = None,
 ) -> tuple[CameraHypothesis, float]:
     """The hypothesis fitted to decoded slots, and how far that moves the clock anywhere on the screen, slots.
 
@@ -48,7 +44,6 @@ def settle(
         lit: (C, N) probability that each slot of the clock's grid is lit.
         light_spread: sigma of the Gaussian that a column's light falls off with, column pitches.
         may_bend: whether the camera may have taken a distortion out, as it cannot from a mosaic.
-        tone: the curve that was undone; None where values are known to follow light.
     """
     model = _Model(joined(strips, max(1, int(clock.rows_per_slot // 4))), lit, light_spread, clock.rows_per_slot)
     start = np.concatenate([[clock.row0, clock.rows_per_slot], _turned(hypothesis.curvature, hypothesis)])
@@ -70,14 +65,30 @@ def settle(
         curvature_sd=sd[2:],
         exposure_slots=exposure,
         exposure_slots_sd=exposure_sd if exposure > least else 0.0,
-        tone=None if tone is None else model.tone(near, tone),
     )
     return found, moved
 
 
 def _turned(bend: FloatArray, hypothesis: CameraHypothesis) -> FloatArray:
     """A bend with rows in the order of readout for one with rows as stored, or the other way round."""
-    return reversed_curvature(bend) if hypothesis.reversed else bend
+    return bend * np.array([1.0, 1.0, -1.0, 1.0]) if hypothesis.reversed else bend
+
+
+def curvature_terms(x: FloatArray, rows: FloatArray, width: int, height: int) -> FloatArray:
+    """Rows that a unit of k1, k2, p1, p2 moves the sensor row of a point, for a focal length of one picture width.
+
+    Args:
+        x: (...) picture x.
+        rows: (...) picture rows, broadcast against `x`.
+        width: of the picture.
+        height: of the picture.
+
+    Returns:
+        (4, ...) float64.
+    """
+    across, down = np.broadcast_arrays((x - (width - 1) / 2) / width, (rows - (height - 1) / 2) / width)
+    square = across**2 + down**2
+    return width * np.stack([down * square, down * square**2, square + 2 * down**2, 2 * across * down])
 
 
 def _chi_square(values: FloatArray, covariance: FloatArray) -> float:
@@ -149,30 +160,6 @@ class _Model:
             if float(np.abs(times - before)[:, ::_BLOCK_ROWS].max()) < SETTINGS.converged_slots:
                 break
         return values, covariance, near
-
-    def tone(self, near: _Near, undone: str) -> tuple[float, float] | None:
-        """The exponent that makes light of the picture's values, and its standard deviation.
-
-        Where values follow light they lie on a line over the shares of a slot that rows see. Light to the power of p is
-        bent by what w^p is above or below w. None where no row sees shares between none and all.
-        """
-        wave, light = near.wave, self.strips.light - self._mean
-
-        def by_column(values: Float32Array) -> FloatArray:
-            return np.asarray((values * near.weight).reshape(self.strips.n_columns, -1).sum(axis=1, dtype=np.float64))
-
-        line, arc = ((values - self._local(values)) * near.gain for values in (wave, wave * (1 - wave)))
-        on_line = by_column(arc * line) / np.maximum(by_column(line * line), TINY)
-        pull = by_column(arc * light) - on_line * by_column(line * light)
-        information = by_column(arc * arc) - on_line * by_column(arc * line)
-        if information.sum() <= 0:
-            return None
-        bend = pull.sum() / information.sum()
-        sd = np.hypot(np.linalg.norm(pull - bend * information) / information.sum(), SETTINGS.tone_bend_sd)
-        half = max(0.5 + bend / 4, SETTINGS.min_half)
-        power = -np.log2(half)
-        exponent = _EXPONENTS[undone] / power
-        return float(exponent), float(exponent * sd / (4 * np.log(2) * half * power))
 
     def _local(self, values: Float32Array) -> Float32Array:
         """Mean of values (M, R) over the screen within the window."""

@@ -13,8 +13,7 @@ class CameraSettings:
     strips_per_column: int = 2
     #: Variance of light that is nothing but rounding.
     min_variance: float = 1e-10
-    #: Levelled light, in root mean squares, at which a column counts as plainly lit or dark; and the least of it.
-    soft_sign: float = 0.5
+    #: Root mean square of levelled light that is nothing but rounding.
     min_soft_sign: float = 0.02
 
     #: Half width of the columns' autocorrelation before anything is known, rows; rounds of estimating it; and the
@@ -22,9 +21,8 @@ class CameraSettings:
     first_width_rows: int = 4
     width_rounds: int = 3
     scale_widths: float = 10.0
-    #: Window of the levels, in half widths of the columns' autocorrelation: the first, and a wider one for columns
-    #: with long runs of lit or dark slots.
-    level_widths: tuple[float, float] = (16.0, 24.0)
+    #: Window of the levels, in half widths of the columns' autocorrelation.
+    level_widths: float = 16.0
     #: Rows that a half width keeps when rows are joined.
     rows_per_width: float = 4.0
     #: Half width of the autocorrelation, slots: from the shortest exposures to those of three slots.
@@ -36,31 +34,12 @@ class CameraSettings:
     #: Rows of the shortest slot that is separable from its neighbours.
     min_rows_per_slot: float = 1.15
 
-    #: Lags between strips that are looked at, rows (and their minimum after joining); and windows of rows.
-    bend_lag_rows: int = 8
-    min_bend_lags: int = 4
-    bend_windows: int = 20
-    #: k1 of corrected lenses, for a focal length of one picture width: standard deviation; and -k2 / k1 of usual ones.
-    k1_sd: float = 0.3
-    k2_shares: tuple[float, float, float] = (0.4, 1.1, 2.0)
-    k1_steps: int = 61
-    #: Weight of all correlations between strips together, log-likelihood.
-    bend_weight: float = 4000.0
-    #: Gains of a bend over none, log-likelihood: from which it is proposed, and from which it alone is.
-    bend_gains: tuple[float, float] = (3.0, 40.0)
-
-    #: Rows over which the power of edges is levelled.
-    edge_level_rows: int = 41
-    #: Peaks that are looked at: of the slots' line, and of the columns' copies for every length of packet.
-    n_lines: int = 4
+    #: Peaks of the columns' copies that are tried for every length of packet, and the minimum score of a hypothesis.
     n_copies: int = 3
-    #: The most that the slots' line counts, log-likelihood; the least score of a hypothesis.
-    max_line: float = 30.0
     min_score: float = 35.0
-    #: Clocks this close, relative, are one.
+    #: Clocks this close, relative, are one; and hypotheses that are proposed.
     same_clock: float = 4e-3
-    #: Hypotheses that are proposed with either window of levels.
-    n_proposed: tuple[int, int] = (5, 3)
+    n_proposed: int = 5
 
     #: Slots over which the picture is taken as constant.
     picture_slots: float = 25.0
@@ -83,13 +62,6 @@ class CameraSettings:
     sd_scale: float = 1.6
     #: Chi-square of the four coefficients from which stripes are bent beyond doubt.
     bent_chi_square: float = 40.0
-
-    #: Exponents below this are nearer to no tone curve than to sRGB.
-    linear_below: float = 1.5
-    #: Error of the bend of light over shares of slots, from textures, sharpening and wrong slots; and the least of half
-    #: the light, whatever the bend.
-    tone_bend_sd: float = 0.25
-    min_half: float = 0.05
 
     #: Rows over which light is levelled to compare strips; likeness of neighbouring strips, 0..1, below which a band of
     #: rows has no stripes; bands; share of them that must have stripes.

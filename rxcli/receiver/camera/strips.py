@@ -102,13 +102,11 @@ def levelled(
     return level, signal / (signal + 16 * random) * inside
 
 
-def soft_sign(level: Float32Array) -> Float32Array:
-    """(n, R) -1 dark to 1 lit: each row of levelled light, bounded by its own root mean square."""
-    rms = np.sqrt(np.square(level).mean(axis=1, keepdims=True))
-    scale = np.float32(SETTINGS.soft_sign) * rms + np.float32(SETTINGS.min_soft_sign)
-    return np.asarray(np.clip(level / scale, -1, 1), np.float32)
-
-
 def columns_of(level: Float32Array, n_columns: int) -> Float32Array:
-    """(C, R) soft sign of the columns, from the levelled light of their strips (M, R)."""
-    return soft_sign(level.reshape(n_columns, -1, level.shape[1]).mean(axis=1))
+    """(C, R) -1 dark to 1 lit: soft sign of the columns, from the levelled light of their strips (M, R).
+
+    Each column is bounded by half of its own root mean square.
+    """
+    mean = level.reshape(n_columns, -1, level.shape[1]).mean(axis=1)
+    rms = np.sqrt(np.square(mean).mean(axis=1, keepdims=True))
+    return np.asarray(np.clip(2 * mean / (rms + np.float32(SETTINGS.min_soft_sign)), -1, 1), np.float32)

@@ -9,7 +9,6 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver import camera as blind
 from rxcli.receiver import sync
 from rxcli.receiver.acquisition import ColumnSampler, noise_of, sample_columns, variants_of
 from rxcli.receiver.cameras import known_camera
@@ -145,7 +144,10 @@ class Proposer:
                 change = SETTINGS.temper * (candidate.log_odds - outline.log_odds)
                 yield self._hypothesis(candidate, camera, _nearest(same_clock, n_columns), log_prior + change)
         by_clock = _by_clock(outline, camera, self.options.screens)
-        yield from self._of_other_columns(scored, by_clock.pop(clock, []))
+        by_columns = {screen.columns: screen for screen in reversed(by_clock.pop(clock, []))}
+        for columns, screen in by_columns.items():
+            if columns != n_columns:
+                yield self._hypothesis(outline, camera, screen, log_prior, hypothesis.rows)
         if _is_clear(scored.reception):
             return
         for same_clock in by_clock.values() if camera.hypothesis is not None else ():
@@ -153,20 +155,6 @@ class Proposer:
             if too_small(self.context(sibling), sibling.screen) is None:
                 yield sibling
         yield from self._of_other_bursts(scored)
-
-    def _of_other_columns(self, scored: Scored, screens: list[ScreenProfile]) -> Iterator[Hypothesis]:
-        """Screens of the same clock with other columns, by the similarity of strips at a distance."""
-        hypothesis, camera = scored.hypothesis, scored.context.camera
-        by_columns = {screen.columns: screen for screen in (*reversed(screens), hypothesis.screen)}
-        own = by_columns.pop(hypothesis.screen.columns)
-        if not by_columns:
-            return
-        sampler, clock = scored.acquisition.sampler, scored.reception.clock
-        misfit = blind.columns_misfit(sampler.binned, clock, [own, *by_columns.values()])
-        for n_columns, screen in by_columns.items():
-            change = SETTINGS.columns_weight * float(np.log(misfit[own.columns] / misfit[n_columns]))
-            log_prior = hypothesis.log_prior + change
-            yield self._hypothesis(hypothesis.outline, camera, screen, log_prior, hypothesis.rows)
 
     def _of_other_bursts(self, scored: Scored) -> Iterator[Hypothesis]:
         """Other bursts of the same copies, if packets are uncertain."""

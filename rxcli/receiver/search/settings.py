@@ -36,8 +36,6 @@ class SearchSettings:
     #: Log prior lost by each further camera, and by rows that are not the outline's likeliest.
     next_camera: float = 0.5
     other_rows: float = 2.5
-    #: Log prior lost per e-fold of the misfit of a number of columns.
-    columns_weight: float = 4.0
     #: Bursts are certain if this share of the columns has packets of this confidence, or if the similarity of copies
     #: leads by this log-likelihood.
     clear_columns: float = 0.9

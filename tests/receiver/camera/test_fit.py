@@ -73,9 +73,9 @@ def _as_stored(curvature: FloatArray, reverse: bool) -> FloatArray:
 
 
 def _settled(
-    strips: blind.Strips, first: blind.CameraHypothesis, lit: FloatArray, tone: str | None = None
+    strips: blind.Strips, first: blind.CameraHypothesis, lit: FloatArray
 ) -> tuple[blind.CameraHypothesis, float]:
-    return blind.settle(strips, first, _clock(first), lit.astype(np.float32), SPREAD, tone=tone)
+    return blind.settle(strips, first, _clock(first), lit.astype(np.float32), SPREAD)
 
 
 def _clock(estimate: blind.CameraHypothesis) -> Clock:
@@ -118,25 +118,6 @@ def test_slots_that_explain_nothing_change_nothing() -> None:
     found, moved_slots = _settled(strips, first, np.full_like(lit, 0.5))
     assert found is first
     assert moved_slots == 0.0
-
-
-@pytest.mark.parametrize(("tone", "power", "exponent"), [("srgb", 1.0, 2.2), ("srgb", 2.2, 1.0), ("linear", 1.0, 1.0)])
-def test_light_that_bends_over_the_slots_tells_the_tone_curve(tone: str, power: float, exponent: float) -> None:
-    strips, lit = _strips(np.random.default_rng(15), np.zeros(4))
-    bent = replace(strips, light=np.maximum(strips.light, 0) ** np.float32(power))
-    found, _ = _settled(bent, _hypothesis(np.zeros(4)), lit, tone)
-    assert found.tone is not None
-    assert found.tone[0] == pytest.approx(exponent, rel=0.2)
-    assert abs(found.tone[0] - exponent) < 2 * found.tone[1]
-    assert blind.is_linear(found.tone) == (exponent < 1.5)
-    assert blind.summary(found, 17300.0)["tone_exponent"] == found.tone
-
-
-def test_values_that_are_known_to_be_light_tell_no_tone_curve() -> None:
-    strips, lit = _strips(np.random.default_rng(15), np.zeros(4))
-    found, _ = _settled(strips, _hypothesis(np.zeros(4)), lit)
-    assert found.tone is None
-    assert "tone_exponent" not in blind.summary(found, 17300.0)
 
 
 def test_the_file_states_the_least_exposure() -> None:

@@ -18,14 +18,13 @@ from rxcli.lab.simulate.optics import Pose
 from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile, parse_profile, shipped_profiles
-from rxcli.protocol import encode_packet, payload_bits
 from rxcli.receiver import camera as blind
 from rxcli.receiver import plane
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.light import NoiseModel
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.receiver.screen import geometry
-from rxcli.types import Clock, FloatArray, Frame, Lens, RowProfiles
+from rxcli.types import FloatArray, Frame, Lens, RowProfiles
 
 SCREENS = tuple(shipped_profiles(ScreenProfile))
 
@@ -93,11 +92,11 @@ def test_unknown_phones_are_proposed_and_fitted(
     frame, corners, truth = phone(
         screen, rows_per_slot, height, corrected=corrected, upside_down=upside_down, k1=k1, seed=height
     )
-    proposed = [one for some in blind.propose(strips_of(frame, corners), SCREENS) for one in some]
-    assert 0 < len(proposed) <= sum(SETTINGS.n_proposed)
+    proposed = blind.propose(strips_of(frame, corners), SCREENS)
+    assert 0 < len(proposed) <= SETTINGS.n_proposed
     right = [one for one in proposed if one.packet_slots == 20 + 10 * truth["payload_symbols"]]
     right = [one for one in right if one.reversed == upside_down]
-    assert min(abs(one.rows_per_slot / rows_per_slot - 1) for one in right) < 5e-3
+    assert min(abs(one.rows_per_slot / rows_per_slot - 1) for one in right) < 2e-2
     estimated = next(receive([frame], ReceiverOptions(cameras=(), corners=corners, cae="never"))).estimated
     found, sd = estimated["rows_per_slot"]
     assert abs(found / rows_per_slot - 1) < 5e-4
@@ -113,7 +112,7 @@ def test_unknown_phones_are_proposed_and_fitted(
 @pytest.mark.parametrize("exposure_slots", [0.5, 1.2, 2.3])
 def test_an_exposure_that_no_file_states_is_proposed_by_the_width_of_the_stripes(exposure_slots: float) -> None:
     frame, corners, _ = phone("paper-17k3", 4.3, 960, exposure_slots=exposure_slots)
-    best = next(blind.propose(strips_of(frame, corners), SCREENS))[0]
+    best = blind.propose(strips_of(frame, corners), SCREENS)[0]
     assert best.rows_per_slot == pytest.approx(4.3, rel=5e-3)
     assert best.exposure_slots == pytest.approx(exposure_slots, abs=0.35)
 
@@ -218,46 +217,14 @@ def test_pictures_that_cannot_work_are_named(kind: str, words: str) -> None:
 
 
 def test_pictures_without_stripes_propose_nothing() -> None:
-    assert not any(blind.propose(_flat_strips(np.zeros((40, 400))), SCREENS))
+    assert not (blind.propose(_flat_strips(np.zeros((40, 400))), SCREENS))
     rng = np.random.default_rng(4)
-    assert not any(blind.propose(_flat_strips(rng.normal(0.3, 0.002, (40, 400))), SCREENS))
-
-
-def test_stripes_of_a_mosaic_are_not_bent() -> None:
-    frame, corners, _ = phone("paper-17k3", 3.4, 960, corrected=True, upside_down=False, k1=0.2, seed=3)
-    strips = strips_of(frame, corners)
-    assert next(blind.propose(strips, SCREENS))[0].curvature.any()
-    assert not any(one.curvature.any() for some in blind.propose(strips, SCREENS, may_bend=False) for one in some)
+    assert not (blind.propose(_flat_strips(rng.normal(0.3, 0.002, (40, 400))), SCREENS))
 
 
 def test_no_screens_is_a_mistake_of_the_caller() -> None:
     with pytest.raises(ValueError, match="screens"):
-        next(blind.propose(_flat_strips(np.zeros((80, 200))), ()))
-
-
-@pytest.mark.parametrize("columns", [20, 100])
-def test_columns_are_counted_by_their_width(columns: int) -> None:
-    rng = np.random.default_rng(columns)
-    screens = [load_profile(name, ScreenProfile) for name in ("paper-34k6", "wide-100")]
-    bits = rng.integers(0, 2, (columns, payload_bits(5, 24)), dtype=np.uint8)
-    slots = np.concatenate([np.stack([encode_packet(b, 5) for b in bits])] * 2, axis=1).astype(np.float64)
-    place = (np.arange(160) + 0.5) / 160 * columns
-    spread = screens[columns == 100].light_spread
-    light = np.exp(-((place[:, None] - np.arange(columns) - 0.5) ** 2) / (2 * spread**2)) @ slots
-    light = np.repeat(light * rng.uniform(0.02, 0.3, (160, 1)), 3, axis=1) + rng.normal(0, 0.01, (160, 3 * 520))
-    profiles = RowProfiles(
-        light=light.reshape(20, 8, -1).astype(np.float32),
-        inside=np.ones((20, 8, light.shape[1]), bool),
-        rows=np.arange(light.shape[1]),
-        sensor_row=None,
-        count=np.full((20, 8), 30.0, np.float32),
-        noise_floor=1e-4,
-        noise_slope=0.0,
-    )
-    clock = Clock(3.0, 1.0, 260, -0.5, 520, 0, np.zeros(2, np.int64), np.zeros(20), 5.0)
-    misfit = blind.columns_misfit(profiles, clock, screens)
-    assert misfit.keys() == {20, 100}
-    assert misfit[columns] < 0.1 * misfit[120 - columns]
+        blind.propose(_flat_strips(np.zeros((80, 200))), ())
 
 
 def test_rows_against_the_readout_are_turned_and_back() -> None:
