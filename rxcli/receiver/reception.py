@@ -113,16 +113,13 @@ def shows_steady_light(reception: Reception) -> bool:
 
 def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:
     """(C,) whether a column has too little light for the light model."""
-    n_observed, n_lit = ((snr > bound).sum(axis=1) for bound in (0.0, 10 ** (SETTINGS.dark_snr_db / 10)))
+    n_observed, n_lit = (snr > 0).sum(axis=1), (snr > 1).sum(axis=1)
     return np.asarray((2 * n_lit < n_observed) | (n_observed == 0))
 
 
 def has_doubtful_packet(reception: Reception, certain: float) -> NDArray[np.bool_]:
     """(C,) whether a complete packet has a confidence below `certain`."""
-    doubtful = (reception.packet_confidence < certain) & (
-        reception.posteriors.log_prob.min(axis=2) < SETTINGS.beyond_doubt_log_prob
-    )
-    return np.asarray((doubtful & complete_packets(reception)).any(axis=0))
+    return np.asarray(((reception.packet_confidence < certain) & complete_packets(reception)).any(axis=0))
 
 
 def complete_packets(reception: Reception) -> NDArray[np.bool_]:

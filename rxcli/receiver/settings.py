@@ -23,10 +23,6 @@ class WiringSettings:
     max_period_rows: int = 100
     switched_share: float = 0.7
 
-    #: Log probability of all symbols from which a column is certain without regard to single slots.
-    beyond_doubt_log_prob: float = -1e-3
-    #: Signal-to-noise ratio below which a column is dark.
-    dark_snr_db: float = -3.0
     #: Log-likelihood below the best weight at which a weight is dropped.
     weight_margin: float = 20.0
     #: Log-likelihood ratio from which a column has packets even without a header; wrong clocks reach 74.
@@ -49,15 +45,10 @@ class StillSettings:
     #: Samples per slot of the first passes, and of later passes over doubtful columns.
     coarse_samples: int = 2
     fine_samples: int = 4
-    #: Rows mixed by the development of a picture, as the width of a box; this widens the exposure.
-    mixed_rows: float = 1.0
-    #: Confidence below which a column with a symbol below `beyond_doubt_log_prob` gets further passes.
-    doubtful: float = 0.985
-    #: Mean log probability of symbols below which a column is hopeless after the first fine pass; before that pass its
-    #: weight may be wrong.
-    beyond_repair_log_prob: float = -0.8
+    #: Confidence below which a column gets further passes.
+    doubtful: float = 0.99
     #: Limit of strip slots for the network, which takes most of the time; the least certain columns are left out.
-    max_network_slots: int = 58_000
+    max_network_slots: int = 100_000
 
 
 SETTINGS, STILL = WiringSettings(), StillSettings()

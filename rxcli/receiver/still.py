@@ -50,7 +50,9 @@ def _may_show_packets(initial: Reception) -> bool:
 
 
 def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception | None = None) -> Reception:
-    """Make an initial pass, and the further `_PASSES` over doubtful columns.
+    """Make an initial pass, and further passes over doubtful columns.
+
+    Each pass uses more of the light than the previous one and replaces its result.
 
     Args:
         acquisition: the clock and the row profiles.
@@ -61,8 +63,8 @@ def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception | 
     candidates = doubtful_columns(reception) if "certain_columns" in skip else np.arange(reception.snr.shape[0])
     lit = candidates[~dark_columns(reception.snr)[candidates]] if "dark_columns" in skip else candidates
     skipped = {"certain_columns": reception.snr.shape[0] - candidates.size, "dark_columns": candidates.size - lit.size}
-    for run_pass, min_log_prob in _PASSES:
-        columns = np.intersect1d(lit, doubtful_columns(reception, min_log_prob)) if "certain_columns" in skip else lit
+    for run_pass in (_coarse, _fine, _without_row_noise, _without_row_noise):
+        columns = np.intersect1d(lit, doubtful_columns(reception)) if "certain_columns" in skip else lit
         if columns.size:
             reception = run_pass(acquisition, reception, columns)
     return replace(reception, skipped={name: count for name, count in skipped.items() if count})
@@ -73,7 +75,7 @@ def initial_pass(acquisition: Acquisition) -> Reception:
     acquisition = acquisition.binned()
     clock = acquisition.clock
     # Demosaicing and denoising mix neighbouring rows: with few rows per slot this widens the effective exposure.
-    exposure_slots = float(np.hypot(clock.exposure_slots, STILL.mixed_rows / clock.rows_per_slot))
+    exposure_slots = float(np.hypot(clock.exposure_slots, 1 / clock.rows_per_slot))
     clock = replace(clock, exposure_slots=exposure_slots)
     samples = sync.sample_slots(acquisition.profiles, clock, STILL.coarse_samples)
     model = _light_model(acquisition, clock, samples)
@@ -96,9 +98,9 @@ def _initial_slots(metrics: FloatArray, isi_memory: int) -> Float32Array:
     return detect.detect(metrics, detect.plausible_weights(metrics, 0.0)).lit
 
 
-def doubtful_columns(reception: Reception, beyond_repair: float = -np.inf) -> NDArray[np.int64]:
-    """Doubtful columns that are not hopeless."""
-    return np.flatnonzero(has_doubtful_packet(reception, STILL.doubtful) & (best_log_prob(reception) > beyond_repair))
+def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
+    """Columns with a complete packet of low confidence."""
+    return np.flatnonzero(has_doubtful_packet(reception, STILL.doubtful))
 
 
 def _coarse(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
@@ -170,7 +172,7 @@ def apply_autoencoder(
         columns = np.arange(reception.snr.shape[0])
         reception = _without_row_noise(acquisition, reception, columns)
     else:
-        columns = _worth_showing(reception, doubtful_columns(reception, STILL.beyond_repair_log_prob))
+        columns = _worth_showing(reception, doubtful_columns(reception))
     scene = reception.scene
     if columns.size == 0 or scene is None:
         return reception, frozenset(), None
@@ -209,16 +211,6 @@ def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: 
     likelihoods = channel.slot_likelihoods(asked, reception.clock, model, scene.lit, columns, timing=False)
     cleaned = replace(reception, cleaned=(scene.samples, model))
     return _with_metrics(cleaned, columns, likelihoods.metrics, likelihoods.snr)
-
-
-#: Passes over doubtful columns between the initial pass and the auto-encoder, with the minimum mean log probability of
-#: their symbols (see `StillSettings`). Each uses more of the light than the previous one and replaces its result.
-_PASSES = (
-    (_coarse, -np.inf),
-    (_fine, -np.inf),
-    (_without_row_noise, STILL.beyond_repair_log_prob),
-    (_without_row_noise, STILL.beyond_repair_log_prob),
-)
 
 
 @lru_cache(maxsize=1)

@@ -89,7 +89,7 @@ def remove_row_noise(scene: DenoiserInput) -> DenoiserInput:
     thin = replace(scene.samples, light=scene.samples.light[:, strips], valid=scene.samples.valid[:, strips])
     model = replace(scene.model, crosstalk=scene.model.crosstalk.of_strips(strips))
     observed = _residuals(replace(scene, samples=thin, model=model), np.arange(len(scene.lit)))
-    rows = _row_light(np.clip(observed.residual, -SETTINGS.row_sigmas, SETTINGS.row_sigmas), observed.scale)[:, None]
+    rows = _row_light(np.clip(observed.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS), observed.scale)[:, None]
     samples = replace(scene.samples, light=scene.samples.light - rows * scene.samples.valid)
     return replace(scene, samples=samples)
 
@@ -226,7 +226,7 @@ def _pooled(values: NDArray[np.floating[Any]], q: int) -> Float32Array:
 
 def _local_level(light: Float32Array, valid: Float32Array, q: int) -> Float32Array:
     """(B, S, n) local mean light of the valid samples."""
-    around = SETTINGS.level_slots * q
+    around = SLOTS_PER_SYMBOL * q
     return np.maximum(box_sums(light, around) / np.maximum(box_sums(valid, around), 1), 0)
 
 

@@ -107,7 +107,7 @@ class _Part:
 
 
 def _likelihoods(part: _Part, thorough: bool) -> SlotLikelihoods:
-    scales = SETTINGS.picture_scales if thorough else SETTINGS.initial_scales
+    scales = SETTINGS.picture_scales if thorough else SETTINGS.picture_scales[1:]
     sums = PictureSums.of(part.light, part.whole, part.valid)
     prediction = predict_picture(sums, part.model.noise.dark_variance, scales, one_sided=thorough)
     timing = np.zeros((part.light.shape[1], 2)) if part.slope is None else _timing(part, prediction)

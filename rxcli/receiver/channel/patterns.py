@@ -9,7 +9,6 @@ from functools import lru_cache
 import numpy as np
 
 from rxcli.protocol import slot_patterns
-from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.receiver.light import Exposure
 from rxcli.types import Clock, Float32Array, FloatArray
 
@@ -26,10 +25,10 @@ def initial_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposu
         weight: (C, N * Q) its weight, in strips of full contrast.
         exposure: exposure of the samples.
     """
-    # Squared errors, weighted so that a slot that fits in all samples has a log-likelihood ratio of `initial_llr`.
+    # Squared errors, weighted so that a slot that fits in all samples has a log-likelihood ratio of 8 in two strips of
+    # full contrast.
     q = exposure.samples_per_slot
-    max_precision = np.float32(SETTINGS.initial_llr / 4 / q)
-    precision = np.minimum(weight / np.float32(SETTINGS.initial_full_strips), 1) * max_precision
+    precision = np.minimum(weight, 2) / np.float32(q)
     value = np.clip(pooled, -1.5, 1.5)
 
     def of_level(place: int, level: float) -> Float32Array:

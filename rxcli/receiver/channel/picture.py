@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.numerics import box_sums
+from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Float32Array
 
@@ -148,9 +149,9 @@ class _Texture:
         error = _around(error)
         error -= self._noise
         error /= _around(shown[:, 0] + shown[:, 1]) + self._noise
-        low, high = SETTINGS.texture_bounds
-        return np.clip(error, np.float32(low), np.float32(high), out=error)
+        return np.clip(error, np.float32(SETTINGS.min_texture), np.float32(2), out=error)
 
 
 def _around(values: Float32Array) -> Float32Array:
-    return box_sums(values, SETTINGS.error_slots // 2)
+    """Sums over the slots at most a symbol away."""
+    return box_sums(values, SLOTS_PER_SYMBOL)

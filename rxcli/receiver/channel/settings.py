@@ -13,28 +13,16 @@ class ChannelSettings:
     #: model was fitted with it.
     slot_information: float = 0.64
     #: Largest light above black, relative to white, of a sample that counts as dark when noise is measured.
-    dark_light: float = 0.002
-    #: Log-likelihood ratio of a slot of full contrast in the initial metrics, and the number of strips of full contrast
-    #: at which it is reached.
-    initial_llr: float = 8.0
-    initial_full_strips: float = 3.0
+    dark_light: float = 0.001
 
-    #: Slots on each side from which the picture is predicted, fine texture to plain sky; and the scales of the initial
-    #: pass, which suit most pictures.
-    picture_scales: tuple[int, ...] = (1, 2, 5, 12)
-    initial_scales: tuple[int, ...] = (2, 5)
-    #: Slots over which the error of a prediction is averaged, and limits of its relative variance: the lower limit
-    #: covers the uncertainty of the crosstalk.
-    error_slots: int = 28
-    texture_bounds: tuple[float, float] = (0.003, 2.0)
-
-    #: Slots on each side over which the local mean light is taken; the network was trained with this value.
-    level_slots: int = 10
+    #: Slots on each side from which the picture is predicted, fine texture to plain sky. The initial pass leaves out
+    #: the finest.
+    picture_scales: tuple[int, ...] = (1, 2, 8)
+    #: Minimum relative variance of a prediction, which covers the uncertainty of the crosstalk.
+    min_texture: float = 0.002
 
     #: Row noise is estimated from every n-th strip, since errors of the strips of a column are correlated.
     row_strips: int = 2
-    #: Limit of the residuals in the estimate of row noise, standard deviations.
-    row_sigmas: float = 3.0
 
 
 SETTINGS = ChannelSettings()

@@ -56,7 +56,7 @@ class _Link:
     def headerless(self, closed: Sequence[confidence.BurstInClip], n_columns: int) -> BoolArray:
         """Add closed bursts; returns (C,) the columns that have shown no headers."""
         header_llr = np.zeros((1, n_columns)) if self.header_llr is None else self.header_llr
-        limit = decode_settings.max_header_llr
+        limit = decode_settings.max_llr
         for burst in closed:
             header_llr = header_llr + np.clip(burst.posteriors.header_llr, -limit, limit)
         self.header_llr = header_llr

@@ -324,8 +324,8 @@ def find_headerless(header_llr: FloatArray) -> BoolArray:
         header_llr: (B, C) of bursts, see `BurstPosteriors`.
     """
     # Glare may hide one header; a good one elsewhere outweighs it.
-    by_column = np.maximum(header_llr, -SETTINGS.max_header_llr).sum(axis=0)
-    together = np.maximum(by_column, -SETTINGS.max_header_llr).sum() > SETTINGS.min_total_header_llr
+    by_column = np.maximum(header_llr, -SETTINGS.max_llr).sum(axis=0)
+    together = np.maximum(by_column, -SETTINGS.max_llr).sum() > SETTINGS.max_llr
     return np.asarray(by_column < (SETTINGS.min_header_llr if together else np.inf), bool)
 
 

@@ -369,7 +369,7 @@ def _symbols_llr(metrics: FloatArray) -> Float32Array:
 
 def _weight_scores(symbols: Float32Array) -> FloatArray:
     """(C, 9) log-likelihood of every weight, from slot log-likelihood ratios (B, C, symbols, 10)."""
-    symbols = np.clip(symbols, -SETTINGS.max_slot_llr, SETTINGS.max_slot_llr)
+    symbols = np.clip(symbols, -SETTINGS.max_llr, SETTINGS.max_llr)
     payload = symbols[:, :, 2:]
     coefficients = np.zeros((*payload.shape[:3], SLOTS_PER_SYMBOL + 1))
     coefficients[..., 0] = 1.0

@@ -20,12 +20,10 @@ class DecodeSettings:
     #: Minimum log-likelihood ratio of a column's headers, all bursts together, against arbitrary slots.
     min_header_llr: float = -2.0
     #: Minimum log-likelihood ratio of the headers of all columns together, and the largest contribution, positive or
-    #: negative, of one header.
-    min_total_header_llr: float = 6.0
-    max_header_llr: float = 12.0
+    #: negative, of one header; and limit of a slot's log-likelihood ratio when weights are compared: one bad slot must
+    #: not decide.
+    max_llr: float = 10.0
 
-    #: Limit of a slot's log-likelihood ratio when weights are compared: one bad slot must not decide.
-    max_slot_llr: float = 12.0
     #: Limit of a soft bit's log-likelihood ratio: about 0.05 % of the surest bits of simulated clips are wrong, mostly
     #: in symbols at the picture's border.
     max_bit_llr: float = 7.6
@@ -39,11 +37,9 @@ class DecodeSettings:
     max_period_packets: float = 0.5
     #: Slots by which the exposure may shift or widen a slot.
     max_shift_slots: int = 2
-    #: Distance from which columns share no light, as a share of the columns and as a number; and the correlation,
-    #: beyond that of the common headers, from which they show one light: packets reach 0.4, a lamp at least 0.65.
-    distant_share: float = 1 / 6
-    distant_columns: int = 3
-    min_similarity: float = 0.59
+    #: Correlation of distant columns, beyond that of the common headers, from which they show one light: packets reach
+    #: 0.4, a lamp at least 0.65.
+    min_similarity: float = 0.5
 
 
 SETTINGS = DecodeSettings()
