@@ -222,7 +222,7 @@ def _in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> C
     """Assign copies to bursts as given, or from metrics (C, N + memory, patterns)."""
     if acquisition.burst is not None:
         return replace(clock, burst=acquisition.burst)
-    return sync.assign_bursts(clock, slot_llr(metrics), acquisition.repeats)
+    return sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)[0][0]
 
 
 def _detect(metrics: FloatArray, clock: Clock) -> BurstPosteriors:

@@ -36,7 +36,7 @@ def propose_cameras(
     # A picture does not show the slot rate: the fastest screen represents all with the same packet length.
     screens = sorted(options.screens, key=lambda screen: -screen.slot_rate_hz)
     with timer("blind"):
-        hypotheses = blind.propose(strips, screens, frame.metadata.exposure_s)
+        hypotheses = blind.propose(strips, screens, frame.metadata.exposure_s, may_bend=frame.mosaic is None)
     for hypothesis in sorted(hypotheses, key=lambda h: (-h.score, h.rows_per_slot, h.reversed)):
         screen = next(s for s in screens if s.packet_slots == hypothesis.packet_slots)
         yield _camera(hypothesis, screen.slot_rate_hz, frame)

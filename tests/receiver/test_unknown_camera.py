@@ -79,7 +79,7 @@ def _proposed(*rows_per_slot: float) -> list[blind.CameraHypothesis]:
 def _chosen(
     frame: Frame, proposed: Iterable[blind.CameraHypothesis], monkeypatch: pytest.MonkeyPatch
 ) -> Found | Failure:
-    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_: list(proposed))
+    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_, **__: list(proposed))
     return search(frame, OPTIONS, Timer())
 
 
@@ -104,7 +104,7 @@ def test_without_packets_there_is_no_camera_but_a_reason(tmp_path: Path, monkeyp
 
 def test_a_period_that_is_somewhat_off_is_fitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, payloads = _frame(tmp_path)
-    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_: _proposed(1.002 * ROWS_PER_SLOT))
+    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_, **__: _proposed(1.002 * ROWS_PER_SLOT))
     result = next(receive([frame], OPTIONS))
     found, sd = result.estimated["rows_per_slot"]
     assert abs(found - ROWS_PER_SLOT) < 4 * sd < 0.01 * ROWS_PER_SLOT

@@ -6,7 +6,8 @@ one to the slots that were decoded with it. docs/blind.md explains both.
 
 from rxcli.receiver.camera.advice import why_not
 from rxcli.receiver.camera.camera import camera_profile, in_time_order, lens_of, summary
-from rxcli.receiver.camera.fit import curvature_terms, settle
+from rxcli.receiver.camera.curvature import curvature_terms
+from rxcli.receiver.camera.fit import settle
 from rxcli.receiver.camera.proposals import CameraHypothesis, propose
 from rxcli.receiver.camera.strips import Strips, strips_of
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.numerics import TINY, local_mean
+from rxcli.receiver.camera.curvature import curvature_terms
 from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips, joined
@@ -72,23 +73,6 @@ def settle(
 def _turned(bend: FloatArray, hypothesis: CameraHypothesis) -> FloatArray:
     """A bend with rows in the order of readout for one with rows as stored, or the other way round."""
     return bend * np.array([1.0, 1.0, -1.0, 1.0]) if hypothesis.reversed else bend
-
-
-def curvature_terms(x: FloatArray, rows: FloatArray, width: int, height: int) -> FloatArray:
-    """Rows that a unit of k1, k2, p1, p2 moves the sensor row of a point, for a focal length of one picture width.
-
-    Args:
-        x: (...) picture x.
-        rows: (...) picture rows, broadcast against `x`.
-        width: of the picture.
-        height: of the picture.
-
-    Returns:
-        (4, ...) float64.
-    """
-    across, down = np.broadcast_arrays((x - (width - 1) / 2) / width, (rows - (height - 1) / 2) / width)
-    square = across**2 + down**2
-    return width * np.stack([down * square, down * square**2, square + 2 * down**2, 2 * across * down])
 
 
 def _chi_square(values: FloatArray, covariance: FloatArray) -> float:

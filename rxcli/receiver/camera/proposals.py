@@ -1,8 +1,9 @@
 """Hypotheses of an unknown camera, best first, from one picture of a sending screen. Nothing is decided here.
 
-Columns repeat themselves a packet later. The periods at which they do are scored by the correlation with the header.
-Read backwards, the header is its own complement, so the sign gives the direction of readout. Stripes are taken as
-straight: `fit` estimates their bend from the decoded slots.
+Edges fall between slots, so their power has a spectral line at the rate of the slots; and columns repeat themselves a
+packet later. The periods that stand out so are scored by the correlation with the header. Read backwards, the header is
+its own complement, so the sign gives the direction of readout. A few bends of the stripes are tried; `fit` estimates
+the bend from the decoded slots.
 """
 
 from __future__ import annotations
@@ -12,15 +13,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.numerics import folded, header_correlation
+from rxcli.numerics import folded, header_correlation, local_mean
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.receiver.camera.curvature import straightened
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips, columns_of, joined, levelled
 from rxcli.types import Float32Array, FloatArray
 
-#: Samples a slot at which headers are sought.
-_SAMPLES = 4
+#: Samples a slot at which headers are sought; bins of the spectrum to a line's width.
+_SAMPLES, _FINE = 4, 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +48,7 @@ class CameraHypothesis:
 
 
 def propose(
-    strips: Strips, screens: Sequence[ScreenProfile], exposure_s: float | None = None
+    strips: Strips, screens: Sequence[ScreenProfile], exposure_s: float | None = None, *, may_bend: bool = True
 ) -> list[CameraHypothesis]:
     """Cameras that may have taken a picture, the best few.
 
@@ -54,6 +56,7 @@ def propose(
         strips: of the picture as it is stored.
         screens: screens that it may show, at least one.
         exposure_s: exposure, None where the file does not state it.
+        may_bend: whether the camera may have taken a distortion out, as it cannot from a mosaic.
 
     Raises:
         ValueError: no screens.
@@ -68,8 +71,10 @@ def propose(
     coarse = joined(strips, max(1, int(width / SETTINGS.rows_per_width)))
     window = round(SETTINGS.level_widths * width / coarse.pitch)
     level, weight = levelled(coarse.light, coarse.inside, window, coarse.noise)
+    bends = [np.array([k1, 0.0, 0.0, 0.0]) for k1 in (SETTINGS.bends if may_bend else (0.0,))]
+    found = [clock for bend in bends for clock in _clocks(coarse, level * weight, bend, width, exposures)]
     distinct: list[CameraHypothesis] = []
-    for hypothesis in sorted(_clocks(coarse, level * weight, width, exposures), key=lambda found: -found.score):
+    for hypothesis in sorted(found, key=lambda clock: -clock.score):
         if len(distinct) < SETTINGS.n_proposed and not any(_is_same(hypothesis, better) for better in distinct):
             distinct.append(hypothesis)
     return distinct
@@ -117,39 +122,49 @@ def _is_same(candidate: CameraHypothesis, better: CameraHypothesis) -> bool:
 
 
 def _clocks(
-    strips: Strips, level: Float32Array, width: float, exposures: dict[int, float]
+    strips: Strips, level: Float32Array, bend: FloatArray, width: float, exposures: dict[int, float]
 ) -> Iterator[CameraHypothesis]:
-    """Clocks that stand out, in any order: at each, columns repeat themselves a packet later."""
-    columns = columns_of(level, strips.n_columns)
+    """Clocks that stand out on stripes of one bend, in any order."""
+    straight = straightened(strips, level, bend)
+    columns = columns_of(straight, strips.n_columns)
     n_rows, pitch = columns.shape[1], strips.pitch
     correlation = _autocorrelation(columns)
     # Of the light itself: soft signs have steeper edges.
-    half_width = _half_width(_autocorrelation(level.reshape(strips.n_columns, -1, n_rows).mean(axis=1)))
+    half_width = _half_width(_autocorrelation(straight.reshape(strips.n_columns, -1, n_rows).mean(axis=1)))
     shortest, longest = (width / slots / pitch for slots in reversed(SETTINGS.half_width_slots))
     shortest = max(shortest, SETTINGS.min_rows_per_slot / pitch)
+    # The line: places are cycles over the picture, times _FINE.
+    line = _slot_line(columns)
+    low, high = (int(_FINE * n_rows / rows) for rows in (longest, shortest))
+    lines = _FINE * n_rows / (low + _peaks(line[low : high + 2], SETTINGS.n_lines, 2 * _FINE))
+    # Light exposed for about a slot has a stronger line at twice the rate.
+    twice, harmonics = 2 * lines, _FINE * np.array([1, 2])
     copies = _surprise(correlation, round(2 * SLOTS_PER_SYMBOL * shortest))
     total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
     for length, exposure in exposures.items():
-        first_lag, last_lag = (int(rows * length) for rows in (shortest, longest))
-        lags = first_lag + _peaks(copies[first_lag : last_lag + 1], SETTINGS.n_copies, max(round(2 * shortest), 1))
-        for rows in (lags / length).tolist():
+        first, last = (int(rows * length) for rows in (shortest, longest))
+        lags = first + _peaks(copies[first : last + 1], SETTINGS.n_copies, max(round(2 * shortest), 1))
+        for rows in np.concatenate([lines, twice[twice < longest], lags / length]).tolist():
             if rows * (length - PREAMBLE_SLOTS) > n_rows:
                 continue  # No payload is in view as a whole.
-            similarity = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
+            common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
+            common += 2 * min(
+                float(np.interp(harmonics * n_rows / rows, np.arange(line.size), line).max()), SETTINGS.max_line
+            )
             for is_reversed, header in enumerate(_header_peaks(total, rows, length)):
-                score = max(header, 0.0) ** 2 + similarity
+                score = max(header, 0.0) ** 2 + common
                 if score < SETTINGS.min_score:
                     continue
                 yield CameraHypothesis(
                     rows_per_slot=rows * pitch,
                     packet_slots=length,
                     reversed=bool(is_reversed),
-                    curvature=np.zeros(4),
+                    curvature=bend,
                     exposure_slots=exposure or exposure_of(half_width / rows, rows * pitch),
                     score=score,
                     # A period that is off by a quarter of a slot over the picture shows as well.
                     rows_per_slot_sd=rows * rows * pitch / (4 * n_rows),
-                    curvature_sd=np.zeros(4),
+                    curvature_sd=np.abs(bend) / 4,
                     stated_exposure_slots=exposure,
                 )
 
@@ -172,6 +187,15 @@ def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:
     # Hardly any row overlaps there.
     out[-SLOTS_PER_SYMBOL:] = 0
     return np.asarray(out)
+
+
+def _slot_line(columns: Float32Array) -> FloatArray:
+    """Spectrum of the edges' power, log-likelihood ratio over chance, by cycles over the picture times _FINE."""
+    steps = np.diff(columns, axis=1)
+    square = np.asarray(steps * steps, np.float32)
+    power = (square - local_mean(square, 10 * SLOTS_PER_SYMBOL)).sum(axis=0, dtype=np.float64)
+    spectrum = np.abs(np.fft.rfft(power, _FINE * columns.shape[1])) ** 2
+    return np.asarray(spectrum / max(float(power @ power), 1e-30))
 
 
 def _peaks(values: FloatArray, n: int, distance: int) -> FloatArray:

@@ -34,8 +34,13 @@ class CameraSettings:
     #: Rows of the shortest slot that is separable from its neighbours.
     min_rows_per_slot: float = 1.15
 
-    #: Peaks of the columns' copies that are tried for every length of packet, and the minimum score of a hypothesis.
-    n_copies: int = 3
+    #: Bends that are tried: k1 for a focal length of one picture width.
+    bends: tuple[float, ...] = (0.0, 0.1, -0.1)
+    #: Peaks that are tried: of the slots' line, and of the columns' copies for every length of packet.
+    n_lines: int = 4
+    n_copies: int = 4
+    #: Maximum weight of the slots' line, log-likelihood, and minimum score of a hypothesis.
+    max_line: float = 30.0
     min_score: float = 35.0
     #: Clocks this close, relative, are one; and hypotheses that are proposed.
     same_clock: float = 4e-3

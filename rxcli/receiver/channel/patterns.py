@@ -25,10 +25,10 @@ def initial_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposu
         weight: (C, N * Q) its weight, in strips of full contrast.
         exposure: exposure of the samples.
     """
-    # Squared errors, weighted so that a slot that fits in all samples has a log-likelihood ratio of 8 in two strips of
-    # full contrast.
+    # Squared errors, weighted so that a slot that fits in all samples has a log-likelihood ratio of 8 in three strips
+    # of full contrast.
     q = exposure.samples_per_slot
-    precision = np.minimum(weight, 2) / np.float32(q)
+    precision = np.minimum(weight / 3, 1) * np.float32(2 / q)
     value = np.clip(pooled, -1.5, 1.5)
 
     def of_level(place: int, level: float) -> Float32Array:

@@ -39,7 +39,7 @@ class DecodeSettings:
     max_shift_slots: int = 2
     #: Correlation of distant columns, beyond that of the common headers, from which they show one light: packets reach
     #: 0.4, a lamp at least 0.65.
-    min_similarity: float = 0.5
+    min_similarity: float = 0.6
 
 
 SETTINGS = DecodeSettings()

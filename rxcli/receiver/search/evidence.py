@@ -34,7 +34,7 @@ def score(reception: Reception, acquisition: Acquisition, evidence: float, log_p
         evidence: see `log_evidence`.
         log_prior: of the hypothesis.
     """
-    packets = acquisition.screen.columns / _COLUMNS * distinct_share(reception)
+    packets = distinct_share(reception)
     complete = bool(complete_packets(reception).any())
     similarity = 0.0
     if complete:

@@ -1,7 +1,6 @@
 """Row profiles to a clock and slot samples (`clock`); the time of the link through a clip (`tracking`)."""
 
 from rxcli.receiver.sync.clock import (
-    assign_bursts,
     binned_strips,
     contrast,
     corrected,
@@ -16,7 +15,6 @@ from rxcli.receiver.sync.clock import (
 )
 
 __all__ = [
-    "assign_bursts",
     "binned_strips",
     "contrast",
     "corrected",

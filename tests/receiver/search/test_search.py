@@ -78,7 +78,7 @@ def test_the_order_of_proposals_screens_and_cameras_does_not_matter(
         monkeypatch.setattr(outlines, "possible_screens", lambda *_: [order(possible)])
         monkeypatch.setattr(Proposer, "_of_camera", lambda *given: order(of_camera(*given)))
         monkeypatch.setattr(Proposer, "siblings", lambda *given: order(siblings(*given)))
-        monkeypatch.setattr(blind, "propose", lambda *given: order(propose(*given)))
+        monkeypatch.setattr(blind, "propose", lambda *given, **named: order(propose(*given, **named)))
         screens, cameras = tuple(order(options.screens)), tuple(order(options.cameras))
         result = receive_frame(trial.frame, replace(options, screens=screens, cameras=cameras))
         return result, payloads_of(result)

@@ -13,7 +13,7 @@ from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_o
 from rxcli.protocol import encode_packet
 from rxcli.receiver import channel, sync
 from rxcli.receiver.decode import detect
-from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, slot_llr
 from rxcli.types import BurstPosteriors, Clock, RowProfiles, SlotSamples
 
 FloatArray = NDArray[np.float64]
@@ -48,13 +48,13 @@ def received(
     )
     contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)
     metrics = channel.initial_metrics(*contrast, model.exposure)
-    clock_ = sync.assign_bursts(clock_, detect.slot_llr(metrics), (REPEATS,))
+    clock_ = sync.possible_bursts(clock_, slot_llr(metrics), (REPEATS,))[0][0]
     for _ in range(rounds):
         posteriors = detect.detect(channel.by_burst(metrics, clock_))
         lit = clock_.on_grid(posteriors.lit)
         found = channel.slot_likelihoods(samples, clock_, model, lit, np.arange(lit.shape[0]))
         metrics = found.metrics
-        clock_ = sync.corrected(sync.assign_bursts(clock_, detect.slot_llr(metrics), (REPEATS,)), found.timing)
+        clock_ = sync.corrected(sync.possible_bursts(clock_, slot_llr(metrics), (REPEATS,))[0][0], found.timing)
         samples = sync.sample_slots(profiles, clock_, Q)
     posteriors = detect.detect(channel.by_burst(metrics, clock_))
     return clock_, posteriors, samples
@@ -198,7 +198,7 @@ def test_bursts_in_every_way_likeliest_first() -> None:
     scores = [score for _, score in possible]
     assert scores == sorted(scores, reverse=True)
     assert scores[0] - scores[1] > 100
-    assert sync.assign_bursts(clock_, llr, (REPEATS,)).burst.tolist() == [0, 0, 1, 1, 1]
+    assert possible[0][0].burst.tolist() == [0, 0, 1, 1, 1]
     alone = replace(clock_, n_slots=70, burst=np.zeros(1, np.int64))
     assert len(sync.possible_bursts(alone, llr[:, :70], (REPEATS,))) == 1
 
