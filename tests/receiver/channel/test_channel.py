@@ -90,17 +90,6 @@ def test_exposure_taps_against_numeric_integration(exposure: float, isi_memory: 
     np.testing.assert_allclose(taps, numeric_taps(exposure, blur, isi_memory, Q), atol=4e-3)
 
 
-@pytest.mark.parametrize(("exposure", "isi_memory"), [(0.01, 1), (0.7, 1), (2.6, 3), (4.7, 5)])
-@pytest.mark.parametrize("q", [1, 2, 4, 7])
-def test_exposure_taps_keep_the_energy(exposure: float, isi_memory: int, q: int) -> None:
-    """As long as exposure and blur fit the memory, each sample's weights add up to one, and so do each slot's."""
-    taps = Exposure.of(exposure, q, isi_memory, 0.25).taps
-    assert (taps >= 0).all()
-    np.testing.assert_allclose(taps.sum(axis=1), 1.0, atol=1e-9)
-    np.testing.assert_allclose(taps, taps[::-1, ::-1], atol=1e-9)
-    assert taps.sum() == pytest.approx(q)
-
-
 @pytest.mark.parametrize("exposure", [1e-6, 0.2, 1.0, 1.08, 1.3, 2.0, 2.6, 3.0, 4.0])
 def test_memory_covers_the_exposure(exposure: float) -> None:
     found = Exposure.of(exposure, Q)
@@ -117,10 +106,6 @@ def test_crosstalk_of_the_specification() -> None:
     assert shares[0, 0] == pytest.approx(0.5, abs=0.02)
     assert shares[-1, 2] == pytest.approx(0.5, abs=0.02)
     np.testing.assert_allclose(shares, shares[::-1, ::-1], atol=1e-12)
-
-
-def test_no_spread_is_no_crosstalk() -> None:
-    np.testing.assert_allclose(Crosstalk.of(5, 0.0).shares, np.tile([0.0, 1.0, 0.0], (5, 1)), atol=1e-12)
 
 
 @pytest.mark.parametrize("ambient", [0.0, 0.03, 0.2])
@@ -164,22 +149,6 @@ def test_clean_slots_have_the_right_sign(kind: str, thorough: bool) -> None:
         inner = slice(3, now.n_slots - 3)
         right.append(((llr > 0) == (lit > 0.5))[:, inner].ravel())
     assert np.concatenate(right).mean() > (0.999 if shot_gain.crosstalk == 0 else 0.995)
-
-
-def test_likelihoods_start_from_nothing_but_contrast() -> None:
-    shot_gain = Shot(texture=0.3, sigma=0.005, start_slot=12.3)
-    link, now, samples, model = scene(shot_gain, seed=3)
-    contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)
-    first = slot_odds(channel.initial_metrics(*contrast, model.exposure), model.exposure.isi_memory)
-    lit = true_slots(link, shot_gain, now.n_slots)
-    idea = (1 / (1 + np.exp(-first))).astype(np.float32)
-    found = channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics
-    llr = slot_odds(found, model.exposure.isi_memory)
-    inner = slice(3, now.n_slots - 3)
-    wrong_first = ((first > 0) != (lit > 0.5))[:, inner].mean()
-    wrong_then = ((llr > 0) != (lit > 0.5))[:, inner].mean()
-    assert wrong_first < 0.1
-    assert wrong_then < 0.01
 
 
 @pytest.mark.parametrize("late", [-0.2, -0.05, 0.0, 0.05, 0.2])
@@ -231,16 +200,6 @@ def test_columns_asked_for_are_those_of_the_whole() -> None:
     assert whole.snr.shape == (6, now.n_slots)
 
 
-def test_more_noise_is_less_signal_to_noise() -> None:
-    ratios = []
-    for sigma in (0.001, 0.01, 0.1):
-        shot_gain = Shot(sigma=sigma, texture=0.05)
-        link, now, samples, model = scene(shot_gain, seed=6)
-        lit = true_slots(link, shot_gain, now.n_slots)
-        ratios.append(float(np.median(channel.slot_likelihoods(samples, now, model, lit, np.arange(6)).snr)))
-    assert ratios[0] > ratios[1] > 4 * ratios[2] > 0
-
-
 def hostile(kind: str, samples: SlotSamples) -> SlotSamples:
     light = np.zeros_like(samples.light)
     valid = samples.valid
@@ -282,15 +241,6 @@ def test_hostile_light_gives_finite_likelihoods(kind: str, thorough: bool, idea:
     if kind == "nothing seen":
         assert (found.metrics == 0).all()
         assert (found.snr == 0).all()
-
-
-def test_metrics_of_independent_slots() -> None:
-    llr = np.random.default_rng(0).normal(0, 3, (2, 30)).astype(np.float32)
-    for isi_memory in (1, 3):
-        metrics = channel.metrics_of(llr, isi_memory)
-        assert metrics.shape == (2, 30 + isi_memory, 2 << isi_memory)
-        newest = slot_patterns(isi_memory)[:, -1] == 1
-        np.testing.assert_allclose((metrics[..., newest] - metrics[..., ~newest])[:, :30].max(axis=2), llr, rtol=1e-5)
 
 
 @pytest.mark.parametrize("exposure_slots", [0.4, 1.0, 1.8, 2.3, 3.4])

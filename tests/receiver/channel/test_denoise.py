@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import pickle
 import re
 import shutil
 from dataclasses import replace
@@ -128,23 +127,11 @@ def test_neighbours_light_is_slots_through_the_exposure(scene: DenoiserInput) ->
     np.testing.assert_allclose(np.moveaxis(feature(strips, "neighbours[4]")[0], 1, 2), alone, atol=0.02)
 
 
-def test_without_crosstalk_neighbours_shed_nothing(scene: DenoiserInput) -> None:
-    alone = with_crosstalk(scene, np.array([[0.0, 1.0, 0.0]] * N_STRIPS))
-    assert feature(network_inputs(alone, np.array([1]))[0], "neighbours[4]").max() < 1e-6
-
-
 def test_delayed_neighbours_move(scene: DenoiserInput) -> None:
     delayed = replace(scene, clock=replace(scene.clock, delay_slots=np.array([1.0, 0.0, 1.0])))
     on_time = feature(network_inputs(scene, np.array([1]))[0], "neighbours[4]")
     late = feature(network_inputs(delayed, np.array([1]))[0], "neighbours[4]")
     np.testing.assert_allclose(late[..., 1:], on_time[..., :-1], atol=1e-5)
-
-
-def test_own_light_is_the_columns_slots_through_the_exposure(scene: DenoiserInput) -> None:
-    strips, _ = network_inputs(scene, np.array([1]))
-    shape = through_exposure(scene.lit, EXPOSURE)[1].reshape(-1, Q)
-    expected = scene.model.crosstalk.shares[:, 1, None, None] * shape
-    np.testing.assert_allclose(np.moveaxis(feature(strips, "own[4]")[0], 1, 2), expected, atol=0.02)
 
 
 def test_right_beliefs_leave_noise_alone(scene: DenoiserInput) -> None:
@@ -189,35 +176,7 @@ def test_one_column_alone_has_no_row_light_to_tell(scene: DenoiserInput) -> None
     np.testing.assert_array_equal(denoise.remove_row_noise(alone).samples.light, alone.samples.light)
 
 
-def test_only_the_own_belief_and_the_neighbours_are_looked_at(scene: DenoiserInput) -> None:
-    lit = scene.lit.copy()
-    lit[0] = 1 - lit[0]
-    far, near = (np.array([column]) for column in (2, 1))
-    name = "neighbours[4]"
-    before, after = (network_inputs(s, far)[0] for s in (scene, replace(scene, lit=lit)))
-    np.testing.assert_array_equal(feature(after, name), feature(before, name))
-    before, after = (network_inputs(s, near)[0] for s in (scene, replace(scene, lit=lit)))
-    assert np.abs(feature(after, name) - feature(before, name)).max() > 0.1
-
-
-def test_brightness_does_not_matter(scene: DenoiserInput) -> None:
-    """Twice the light with twice the noise is the same scene."""
-    noise = scene.model.noise
-    brighter = NoiseModel(4 * noise.dark_variance, 2 * noise.shot_gain)
-    twice = replace(
-        scene,
-        samples=replace(scene.samples, light=2 * scene.samples.light),
-        model=replace(scene.model, black_level=2 * scene.model.black_level, noise=brighter),
-    )
-    columns = np.arange(N_COLUMNS)
-    np.testing.assert_allclose(network_inputs(twice, columns)[0], network_inputs(scene, columns)[0], atol=1e-4)
-
-
 SHIPPED = sorted(path.parent.name for path in data_dir("models").glob("*/model.onnx"))
-
-
-def test_a_model_is_shipped() -> None:
-    assert denoise.DEFAULT_MODEL in SHIPPED
 
 
 @pytest.mark.parametrize("name", SHIPPED)
@@ -308,20 +267,6 @@ def test_columns_and_the_order_of_strips_do_not_touch_each_other(scene: Denoiser
         with_crosstalk(replace(scene, samples=samples), scene.model.crosstalk.shares[order]), np.array([0, 1, 2])
     )
     np.testing.assert_allclose(mixed, together, atol=1e-2)
-
-
-def test_the_session_is_made_when_first_needed_and_once(scene: DenoiserInput) -> None:
-    denoiser = load_denoiser()
-    assert "_session" not in vars(denoiser)
-    denoiser.slot_corrections(scene, np.array([0]))
-    session = vars(denoiser)["_session"]
-    denoiser.slot_corrections(scene, np.array([1]))
-    assert vars(denoiser)["_session"] is session
-    copy = pickle.loads(pickle.dumps(denoiser))
-    assert "_session" not in vars(copy)
-    np.testing.assert_array_equal(
-        copy.slot_corrections(scene, np.array([1])), denoiser.slot_corrections(scene, np.array([1]))
-    )
 
 
 @pytest.fixture

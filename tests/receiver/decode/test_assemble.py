@@ -130,12 +130,6 @@ def test_a_payload_slot_that_was_never_seen_is_no_packet() -> None:
     assert [len(c.packets) for c in columns] == [1, 1]
 
 
-def test_a_cut_copy_completes_another() -> None:
-    """The end of one copy and the beginning of the next hold every slot once: 60 slots from slot 25 on."""
-    columns = results_of(clock_of(60, 25, [0, 0]), posteriors_of([5, 5], indices([5, 5])), snr(60), samples_of(60), 0)
-    assert [c.packets[0].copies for c in columns] == pytest.approx([1.2, 1.2])
-
-
 def test_slots_off_the_screen_are_not_seen() -> None:
     clock, samples = clock_of(60, 0, [0, 0]), samples_of(60)
     valid = samples.valid.copy()
@@ -199,21 +193,6 @@ def test_slots_that_speak_against_a_packet_make_it_less_sure() -> None:
     one, two = confidences([25]), confidences([25, 77])
     assert two[0] < one[0] < sure[0]
     assert two[1] == one[1] == sure[1]
-
-
-def test_the_more_strips_a_column_has_the_less_its_posterior_counts() -> None:
-    """Strips err together: each adds to the posterior what it says alone."""
-    w, slot_margin = [5], np.full((1, 1, PACKET), 10.0, np.float32)
-    sure = posteriors_of(w, indices(w), 0.999)
-    found = [
-        float(
-            confidence.confidence(
-                confidence.confidence_features(sure, slot_margin, np.zeros(1, bool), n_strips)
-            ).squeeze()
-        )
-        for n_strips in (1, 2, 4, 7)
-    ]
-    assert 1 > found[0] > found[1] > found[2] > found[3] > 0.9
 
 
 def test_where_slots_stand_out_a_symbol_in_doubt_leaves_the_packet_in_doubt() -> None:

@@ -143,13 +143,6 @@ def test_weight_probabilities_agree_with_enumeration(isi_memory: int) -> None:
         assert found.w[column] == confidence_features.argmax() + 1
 
 
-def test_what_is_known_of_a_packet_is_lit_as_sent() -> None:
-    metrics = np.random.default_rng(0).normal(0, 1, (1, 9, 41, 4))
-    for w in WEIGHTS:
-        lit = detect(metrics, only(w, 9)).lit[0, :, :20]
-        assert (lit == np.concatenate([HEADER, dimming_symbol(w)])).all()
-
-
 @pytest.mark.parametrize(("w", "sigma"), [(1, 0.45), (9, 0.45), (1, 0.6)])
 def test_symbol_error_rate_of_one_pulse_follows_theory(w: int, sigma: float) -> None:
     """Weights 1 and 9 are orthogonal signals: P(right) = E[Phi(x + 1/sigma)^7], as eight of the ten words are sent."""
@@ -161,31 +154,6 @@ def test_symbol_error_rate_of_one_pulse_follows_theory(w: int, sigma: float) -> 
     right = np.trapezoid(np.exp(-((x - 1 / sigma) ** 2) / 2) / sqrt(2 * pi) * below**7, x)
     n, errors = tx.size, int((rx != tx).sum())
     assert abs(errors - n * (1 - right)) < 4 * sqrt(n * right * (1 - right))
-
-
-@pytest.mark.parametrize("w", [3, 5, 8])
-def test_decisions_in_white_noise_are_those_of_a_correlator(w: int) -> None:
-    rng = np.random.default_rng(w)
-    tx = rng.integers(0, 1 << bits_per_symbol(w), (200, 12))
-    metrics = sent_through(tx, w, WHITE, 0.5, rng)
-    llr = metrics[0, :, 20:-1, 1] - metrics[0, :, 20:-1, 0]
-    correlation = llr.reshape(200, 12, 10) @ codebook(w).T
-    expected = correlation.argmax(axis=2)
-    assert 0.02 < (expected != tx).mean() < 0.6
-    assert (detect(metrics, only(w, 200)).index[0] == expected).all()
-
-
-def test_interference_that_is_known_costs_little() -> None:
-    """Half a slot of the one before: a receiver that ignores it errs often, the trellis hardly more than without."""
-    rng = np.random.default_rng(7)
-    tx = rng.integers(0, 128, (300, 10))
-    taps, sigma = np.array([[0.5, 0.5]]), 0.12
-    observed = observe(tx, 5, taps, sigma, rng)
-    metrics, ignoring = gaussian_metrics(observed, taps, sigma), gaussian_metrics(observed, WHITE, sigma)
-    errors = (detect(metrics, only(5, 300)).index[0] != tx).mean()
-    blind_errors = (detect(ignoring, only(5, 300)).index[0] != tx).mean()
-    assert errors < 0.03
-    assert blind_errors > 5 * errors
 
 
 @pytest.mark.parametrize(
@@ -240,19 +208,6 @@ def test_the_first_guess_is_exact_where_slots_are_independent(isi_memory: int) -
     found = detect(metrics, np.array(WEIGHTS) == w[:, None])
     np.testing.assert_allclose(guess, found.lit, atol=1e-4)
     assert 0.01 < np.abs(guess[..., 20:] - tx[:, 20:]).mean() < 0.2
-
-
-@pytest.mark.parametrize("isi_memory", [1, 3])
-def test_constants_added_to_all_patterns_of_a_slot_change_nothing(isi_memory: int) -> None:
-    rng = np.random.default_rng(isi_memory)
-    metrics = rng.normal(0, 1, (2, 5, 40 + isi_memory, 2 << isi_memory))
-    shifted = metrics + rng.normal(0, 300, metrics.shape[:3])[..., None]
-    one, other = detect(metrics), detect(shifted)
-    assert (one.w == other.w).all()
-    assert (one.index == other.index).all()
-    np.testing.assert_allclose(one.w_log_prob, other.w_log_prob, atol=5e-3)
-    np.testing.assert_allclose(one.bit_llr, other.bit_llr, rtol=2e-3, atol=5e-3)
-    assert (plausible_weights(metrics, 5.0) == plausible_weights(shifted, 5.0)).all()
 
 
 def test_columns_and_bursts_do_not_touch_one_another() -> None:
