@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from rxcli.protocol import HEADER, slot_patterns
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
-#: Longest exposure, slots, that each ISI memory covers; longer exposures use `MAX_MEMORY`.
-_MEMORY_EXPOSURE_SLOTS = {1: 1.3, 3: 2.6}
+#: Slots of exposure that each further two slots of ISI memory cover.
+_MEMORY_SLOTS = 1.3
 #: Longest ISI memory of the trellis; five slots cover an exposure of four.
 MAX_MEMORY = 5
 #: The dark slots in the middle of a header.
@@ -98,23 +98,20 @@ class Exposure:
     taps: FloatArray
 
     @staticmethod
-    def of(
-        exposure_slots: float, samples_per_slot: int, isi_memory: int | None = None, blur_slots: float | None = None
-    ) -> Exposure:
+    def of(exposure_slots: float, samples_per_slot: int, isi_memory: int | None = None) -> Exposure:
         """Build the response of an exposure.
 
         Args:
             exposure_slots: length of the exposure, slots.
             samples_per_slot: samples per slot, Q.
             isi_memory: ISI memory; None for the shortest that covers the exposure.
-            blur_slots: width of a further box filter, slots; None for the length of a sample.
         """
         if isi_memory is None:
-            isi_memory = next(
-                (n for n, longest in _MEMORY_EXPOSURE_SLOTS.items() if exposure_slots <= longest), MAX_MEMORY
-            )
+            # Odd, so that metrics lie between samples; the slots at both ends are hardly exposed.
+            isi_memory = int(np.clip(2 * np.ceil(exposure_slots / _MEMORY_SLOTS) - 1, 1, MAX_MEMORY))
         n_fine, q = 32, samples_per_slot
-        offsets = ((np.arange(n_fine) + 0.5) / n_fine - 0.5) * max(blur_slots or 1 / q, _MIN_SLOTS)
+        # A sample is a mean over its own length.
+        offsets = ((np.arange(n_fine) + 0.5) / n_fine - 0.5) / q
         centres = -isi_memory / 2 + (np.arange(q) + 0.5) / q
         fine = (centres[:, None] + offsets)[:, None, :]
         slots = np.arange(-isi_memory, 1)[:, None]

@@ -102,7 +102,7 @@ class _Model:
         shares = column_light(strips.light.shape[0], strips.n_columns, light_spread)
         mixed = np.asarray(shares / shares.sum(axis=1, keepdims=True) @ lit, np.float32)
         self.strips = strips
-        self._slots = SlotLight(mixed, 0.5)
+        self._slots = SlotLight(mixed)
         self._window = max(round(SETTINGS.picture_slots * rows_per_slot / strips.pitch), 1)
         self._inside = local_mean(strips.inside, self._window) + np.float32(1e-3)
         self._mean = self._local(strips.light)

@@ -15,9 +15,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
@@ -48,7 +46,6 @@ COLUMN_FEATURES = ("known", "phase[10]", "believed", "lent", "weight", "score", 
 N_STRIP_FEATURES, N_COLUMN_FEATURES = 26, 16
 #: Limit of residuals in features, standard deviations; the network was trained with it.
 _RESIDUAL_SIGMAS = 4.0
-_MAX_MODEL_BYTES = 2_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,8 +315,6 @@ def _read_card(path: Path) -> ModelCard:
 def _read_weights(path: Path, card: ModelCard) -> bytes:
     hint = "install the package again, or export the model again with vlc-rx train"
     try:
-        if path.stat().st_size > _MAX_MODEL_BYTES:
-            raise ProfileError(f"{path}: larger than {_MAX_MODEL_BYTES} bytes", hint)
         data = path.read_bytes()
     except OSError as error:
         raise ProfileError(f"{path}: cannot be read ({error.strerror})", hint) from None
@@ -337,6 +332,7 @@ class OnnxDenoiser:
         self.card = card
         self._weights = weights
         self._threads = threads
+        self._session: Any = None
 
     @property
     def name(self) -> str:
@@ -352,39 +348,26 @@ class OnnxDenoiser:
             ProfileError: the file is not the network described by its card.
         """
         strips, features = network_inputs(scene, columns)
-        contract = self.card.contract
+        contract, onnxruntime = self.card.contract, onnx_runtime()
         fed = {contract.strips: strips, contract.columns: features}
-        correction = np.asarray(self._session.run([contract.correction], fed)[0], np.float32)
-        return correction * payload_observed(scene)[columns]
+        try:
+            if self._session is None:
+                self._session = onnxruntime.InferenceSession(
+                    self._weights, self._options(onnxruntime), providers=["CPUExecutionProvider"]
+                )
+            (correction,) = self._session.run([contract.correction], fed)
+        except Exception as error:
+            reason = str(error).splitlines()[0]
+            raise ProfileError(f"model {self.name}: ONNX Runtime refuses it ({reason})", "export it again") from None
+        return np.asarray(correction, np.float32) * payload_observed(scene)[columns]
 
-    @cached_property
-    def _session(self) -> Any:
-        onnxruntime = onnx_runtime()
+    def _options(self, onnxruntime: Any) -> Any:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self._threads
         options.inter_op_num_threads = 1
         options.log_severity_level = 3
-        try:
-            session = onnxruntime.InferenceSession(self._weights, options, providers=["CPUExecutionProvider"])
-        except Exception as error:
-            reason = str(error).splitlines()[0]
-            raise ProfileError(f"model {self.name}: ONNX Runtime refuses it ({reason})", "export it again") from None
-        self._check_tensors(session.get_inputs(), session.get_outputs())
-        return session
-
-    def _check_tensors(self, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
-        contract = self.card.contract
-        wanted = {contract.strips: (4, 2, N_STRIP_FEATURES), contract.columns: (3, 1, N_COLUMN_FEATURES)}
-        found = {tensor.name: tensor.shape for tensor in inputs}
-        fits = found.keys() == wanted.keys() and all(
-            len(found[name]) == rank and found[name][axis] == size for name, (rank, axis, size) in wanted.items()
-        )
-        if not fits or [tensor.name for tensor in outputs] != [contract.correction]:
-            raise ProfileError(
-                f"model {self.name}: its tensors {found} are not those of its contract {sorted(wanted)}",
-                "export it again with vlc-rx train",
-            )
+        return options
 
     def __getstate__(self) -> dict[str, Any]:
         """Sessions do not travel to worker processes."""
-        return {"card": self.card, "_weights": self._weights, "_threads": self._threads}
+        return {"card": self.card, "_weights": self._weights, "_threads": self._threads, "_session": None}

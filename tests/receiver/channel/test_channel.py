@@ -83,11 +83,10 @@ def numeric_taps(exposure: float, blur: float, isi_memory: int, q: int) -> Float
     return out
 
 
-@pytest.mark.parametrize("blur", [0.01, 0.25, 0.6])
 @pytest.mark.parametrize(("exposure", "isi_memory"), [(0.05, 1), (0.5, 1), (1.08, 1), (1.08, 3), (2.2, 3), (4.0, 5)])
-def test_exposure_taps_against_numeric_integration(exposure: float, isi_memory: int, blur: float) -> None:
-    taps = Exposure.of(exposure, Q, isi_memory, blur).taps
-    np.testing.assert_allclose(taps, numeric_taps(exposure, blur, isi_memory, Q), atol=4e-3)
+def test_exposure_taps_against_numeric_integration(exposure: float, isi_memory: int) -> None:
+    taps = Exposure.of(exposure, Q, isi_memory).taps
+    np.testing.assert_allclose(taps, numeric_taps(exposure, 1 / Q, isi_memory, Q), atol=4e-3)
 
 
 @pytest.mark.parametrize("exposure", [1e-6, 0.2, 1.0, 1.08, 1.3, 2.0, 2.6, 3.0, 4.0])

@@ -329,17 +329,6 @@ def test_what_is_no_network_is_refused_when_it_is_needed(model: Path, scene: Den
         load_denoiser(str(model)).slot_corrections(scene, np.array([0]))
 
 
-def test_a_foreign_network_is_refused(model: Path, scene: DenoiserInput) -> None:
-    onnx = pytest.importorskip("onnx", reason="onnx (extra train) makes the foreign network")
-    tensor = onnx.helper.make_tensor_value_info("image", onnx.TensorProto.FLOAT, [1, 3, None, None])
-    out = onnx.helper.make_tensor_value_info("label", onnx.TensorProto.FLOAT, [1, 3, None, None])
-    graph = onnx.helper.make_graph([onnx.helper.make_node("Relu", ["image"], ["label"])], "foreign", [tensor], [out])
-    made = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8)
-    replace_weights(model, made.SerializeToString())
-    with pytest.raises(ProfileError, match=r"its tensors .*image.* are not those of its contract"):
-        load_denoiser(str(model)).slot_corrections(scene, np.array([0]))
-
-
 @pytest.fixture(scope="module")
 def trials() -> dict[str, Trial]:
     """A clean frame, and one whose long exposure leaves the receiver in doubt."""
