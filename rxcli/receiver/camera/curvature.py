@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips
 from rxcli.types import Float32Array, FloatArray
 
@@ -39,3 +40,11 @@ def straightened(strips: Strips, level: Float32Array, curvature: FloatArray) -> 
     below, above = np.take_along_axis(level, low, 1), np.take_along_axis(level, low + 1, 1)
     out = below + (above - below) * (place - low).astype(np.float32)
     return np.asarray(out * (np.abs(index - back - place) < 0.5), np.float32)
+
+
+def likeliest_bend(strips: Strips, level: Float32Array) -> FloatArray:
+    """(4,) bend, other than none, under which the levelled light (M, R) of neighbouring strips is most similar."""
+    # Lenses bend back further out: k2 is about -k1.
+    bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, 8)[:, None] * np.array([1.0, -1.0, 0.0, 0.0])
+    straight = (straightened(strips, level, bend) for bend in bends)
+    return np.asarray(bends[np.argmax([(light[:-1] * light[1:]).sum() for light in straight])])

@@ -2,8 +2,8 @@
 
 Edges fall between slots, so their power has a spectral line at the rate of the slots; and columns repeat themselves a
 packet later. The periods that stand out so are scored by the correlation with the header. Read backwards, the header is
-its own complement, so the sign gives the direction of readout. A few bends of the stripes are tried; `fit` estimates
-the bend from the decoded slots.
+its own complement, so the sign gives the direction of readout. The bend of the stripes is taken from the
+similarity of neighbouring strips; `fit` estimates it from the decoded slots.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from rxcli.numerics import folded, header_correlation, local_mean
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
-from rxcli.receiver.camera.curvature import straightened
+from rxcli.receiver.camera.curvature import likeliest_bend, straightened
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips, columns_of, joined, levelled
 from rxcli.types import Float32Array, FloatArray
@@ -71,8 +71,9 @@ def propose(
     coarse = joined(strips, max(1, int(width / SETTINGS.rows_per_width)))
     window = round(SETTINGS.level_widths * width / coarse.pitch)
     level, weight = levelled(coarse.light, coarse.inside, window, coarse.noise)
-    bends = [np.array([k1, 0.0, 0.0, 0.0]) for k1 in (SETTINGS.bends if may_bend else (0.0,))]
-    found = [clock for bend in bends for clock in _clocks(coarse, level * weight, bend, width, exposures)]
+    level *= weight
+    bends = [np.zeros(4)] + ([likeliest_bend(coarse, level)] if may_bend else [])
+    found = [clock for bend in bends for clock in _clocks(coarse, level, bend, width, exposures)]
     distinct: list[CameraHypothesis] = []
     for hypothesis in sorted(found, key=lambda clock: -clock.score):
         if len(distinct) < SETTINGS.n_proposed and not any(_is_same(hypothesis, better) for better in distinct):

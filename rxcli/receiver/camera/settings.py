@@ -34,8 +34,8 @@ class CameraSettings:
     #: Rows of the shortest slot that is separable from its neighbours.
     min_rows_per_slot: float = 1.15
 
-    #: Bends that are tried: k1 for a focal length of one picture width.
-    bends: tuple[float, ...] = (0.0, 0.1, -0.1)
+    #: Largest bend that is tried: k1 for a focal length of one picture width.
+    max_bend: float = 0.2
     #: Peaks that are tried: of the slots' line, and of the columns' copies for every length of packet.
     n_lines: int = 4
     n_copies: int = 4

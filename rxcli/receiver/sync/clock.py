@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.numerics import TINY, folded, header_correlation
-from rxcli.protocol import EXTREMES_SLOTS, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.protocol import EXTREMES_SLOTS, HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
@@ -209,11 +209,15 @@ def find_clock(
     start, header_peak_ratio = header_comb(power, SETTINGS.search_samples)
     if not np.isfinite(start):
         return None
-    llr = _header_llr(pooled, weight, packet_slots * SETTINGS.search_samples)
-    if header_peak_ratio < SETTINGS.clear_header_lead:
-        staggered_start, staggered_ratio = _staggered_comb(llr)
-        if staggered_ratio > header_peak_ratio:
-            start, header_peak_ratio = staggered_start, staggered_ratio
+    delays = _delays(pooled, weight, start, packet_slots)
+    many_delays = np.count_nonzero(delays) > delays.size * SETTINGS.many_columns
+    if header_peak_ratio < SETTINGS.clear_header_lead or many_delays:
+        staggered_start, staggered_ratio, staggered_delays = _staggered_comb(
+            pooled, weight, packet_slots * SETTINGS.search_samples
+        )
+        if staggered_ratio > header_peak_ratio or many_delays:
+            start, delays = staggered_start, staggered_delays
+            header_peak_ratio = max(header_peak_ratio, staggered_ratio)
     row0 = top + start * step
     before = int(np.ceil((row0 - top) / rows_per_slot))
     n_slots = before + int(np.ceil((bottom - row0) / rows_per_slot))
@@ -227,7 +231,7 @@ def find_clock(
         n_slots=n_slots,
         first_slot=first_slot,
         burst=np.zeros(n_copies, np.int64),
-        delay_slots=_delays(llr, start),
+        delay_slots=delays,
         header_peak_ratio=header_peak_ratio,
     )
 
@@ -268,52 +272,62 @@ def _rival(score: FloatArray, best: int, samples_per_slot: int, further: int = 0
     return max(float(away.max(initial=0.0)), TINY)
 
 
-def _header_llr(pooled: Float32Array, weight: Float32Array, period: int) -> FloatArray:
-    """(C, period) log-likelihood ratio of a header at each position in a packet against random slots, by column.
+def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> tuple[float, float, FloatArray]:
+    """Start, lead and delays of columns whose delays are too different for their mean to show a header.
 
-    It is proportional to twice the correlation minus its bound; a header in full contrast has 1 in every copy.
-    """
-    length = SLOTS_PER_SYMBOL * SETTINGS.search_samples
-    share = weight / (weight + 1.0)
-    total = np.cumsum(np.pad(share, ((0, 0), (1, length - 1))), axis=1)
-    bound = (total[:, length:] - total[:, :-length]) / length
-    return folded(2 * _header_correlation(pooled * share, SETTINGS.search_samples) - bound, period)
-
-
-def _staggered_comb(llr: FloatArray) -> tuple[float, float]:
-    """Start and lead of packets whose columns are delayed too differently for their mean to show a header.
-
-    The start is where most columns have a peak within reach of a delay.
+    Folds each column's own header correlation; the start is where most columns have a peak within reach.
     """
     import cv2
 
+    n_columns = pooled.shape[0]
+    length = SLOTS_PER_SYMBOL * SETTINGS.search_samples
+    share = np.pad(weight / (weight + 1.0), ((0, 0), (0, length - 1)))
+    total = np.cumsum(np.pad(share, ((0, 0), (1, 0))), axis=1)
+    bound = (total[:, length:] - total[:, :-length]) / length
+    responses = _header_correlation(pooled * (weight / (weight + 1.0)), SETTINGS.search_samples)
+    # Twice the correlation minus its bound is proportional to the log-likelihood ratio against random slots.
+    llr = folded(2 * responses - bound, period)
     reach = int(SETTINGS.max_delay_slots * SETTINGS.search_samples)
-    wrapped = np.pad(llr, ((0, 0), (reach, reach)), mode="wrap")
-    near = cv2.dilate(wrapped, np.ones((1, 2 * reach + 1), np.uint8))[:, reach:-reach]
+    wide = reach + SETTINGS.search_samples
+    wrapped = np.pad(llr, ((0, 0), (wide, wide)), mode="wrap")
+    near = cv2.dilate(wrapped, np.ones((1, 2 * reach + 1), np.uint8))[:, wide : wide + period]
     score = np.maximum(near, 0).sum(axis=0)
     start = int(score.argmax())
-    _, fine = _peaks_near(llr, start)
-    return (start + float(np.median(fine))) % score.size, score[start] / _rival(
-        score, start, SETTINGS.search_samples, 2 * reach
+    header_peak_ratio = score[start] / _rival(score, start, SETTINGS.search_samples, 2 * reach)
+    around = wrapped[:, start : start + 2 * wide + 1]
+    best = around.argmax(axis=1)
+    delays = best + _parabola(around, best) - wide
+    sure = around[np.arange(n_columns), best] > 0
+    middle = float(np.median(delays[sure])) if sure.any() else 0.0
+    return (
+        (start + middle) % period,
+        float(header_peak_ratio),
+        np.where(sure, delays - middle, 0.0) / SETTINGS.search_samples,
     )
 
 
-def _delays(llr: FloatArray, start: float) -> FloatArray:
-    """(C,) delays, slots, of columns whose headers fit clearly better than at the common start; of all if half do."""
-    gain, fine = _peaks_near(llr, round(start))
-    is_delayed = gain > SETTINGS.delay_lead
-    if 2 * is_delayed.sum() > is_delayed.size:
-        is_delayed = gain > 0
-    return np.where(is_delayed, fine + round(start) - start, 0.0) / SETTINGS.search_samples
-
-
-def _peaks_near(llr: FloatArray, start: int) -> tuple[FloatArray, FloatArray]:
-    """(C,) how much each column's peak exceeds its value at `start`, and the distance of the peak, samples."""
-    reach = int(SETTINGS.max_delay_slots * SETTINGS.search_samples) + SETTINGS.search_samples
-    around = llr[:, np.arange(start - reach, start + reach + 1) % llr.shape[1]]
-    best = around.argmax(axis=1)
-    top = around[np.arange(best.size), best]
-    return np.where(top > 0, top - around[:, reach], 0.0), best + _parabola(around, best) - reach
+def _delays(pooled: Float32Array, weight: Float32Array, start: float, packet_slots: int) -> FloatArray:
+    """Delay of each column against the common clock, slots; 0 where it is not significant."""
+    reach = int(SETTINGS.max_delay_slots * SETTINGS.search_samples) + 2
+    template = np.repeat(2.0 * np.array(HEADER) - 1, SETTINGS.search_samples) / (
+        SLOTS_PER_SYMBOL * SETTINGS.search_samples
+    )
+    share = weight / (weight + 1.0)
+    n = pooled.shape[1]
+    starts = np.arange(round(start), n, packet_slots * SETTINGS.search_samples)
+    index = starts[:, None, None] + np.arange(-reach, reach + 1)[:, None] + np.arange(template.size)
+    observed = (index >= 0) & (index < n)
+    signal = (pooled * share)[:, np.clip(index, 0, n - 1)] * observed
+    score = (signal * template).sum(axis=(1, 3))
+    best = score.argmax(axis=1)
+    fine = (best + _parabola(score, best) - reach - (start - round(start))) / SETTINGS.search_samples
+    top = score[np.arange(best.size), best]
+    strong = top > 0.5 * np.median(top)
+    scattered = (
+        np.mean(np.abs(fine[strong]) > SETTINGS.same_delay_slots) > SETTINGS.many_columns if strong.any() else False
+    )
+    moved = (top - score[:, reach] > SETTINGS.delay_lead) | scattered
+    return np.where(moved & strong & (best > 0) & (best < 2 * reach), fine, 0.0)
 
 
 def _parabola(score: FloatArray, best: NDArray[np.int64]) -> FloatArray:

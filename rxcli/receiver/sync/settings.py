@@ -20,10 +20,13 @@ class SyncSettings:
 
     #: Largest delay of a column against the common clock, slots (air interface).
     max_delay_slots: float = 2.0
-    #: Minimum gain of a column's delay, in headers of full contrast.
-    delay_lead: float = 0.1
+    #: Share of the columns that may appear delayed by more than the second number of slots when none is.
+    many_columns: float = 0.25
+    same_delay_slots: float = 0.12
+    #: Minimum gain of a single column's delay in header correlation, added over the copies.
+    delay_lead: float = 0.3
     #: Header lead (peak over rival) below which delayed columns are tried.
-    clear_header_lead: float = 2.0
+    clear_header_lead: float = 2.5
     #: Root-mean-square deviation, slots, below which columns count as undelayed in the light model.
     same_timing_slots: float = 0.03
     #: Fisher information of the prior of a column's delay: a standard deviation of a tenth of a slot.
