@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from dataclasses import replace
-from typing import Protocol, Self, TypeVar
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import camera as blind
 from rxcli.receiver.acquisition import Acquisition, outlines_of, sample_columns
-from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure, FrameContext, Timer
 from rxcli.receiver.reception import Reception
 from rxcli.types import FloatArray, Frame, RowProfiles
@@ -71,46 +69,6 @@ def settle(context: FrameContext, acquisition: Acquisition, reception: Reception
             may_bend=frame.mosaic is None,
         )
     return _camera(found, screen.slot_rate_hz, frame), moved_slots
-
-
-class InitialPass(Protocol):
-    """Initial pass with a camera, and the evidence of its packets."""
-
-    @property
-    def context(self) -> FrameContext: ...
-    @property
-    def acquisition(self) -> Acquisition: ...
-    @property
-    def reception(self) -> Reception: ...
-    @property
-    def evidence(self) -> float: ...
-    def with_camera(self, camera: Camera) -> Self:
-        """Replace the camera."""
-
-
-_Pass = TypeVar("_Pass", bound=InitialPass)
-
-
-def fitted(best: _Pass, received: Callable[[Camera], _Pass | None]) -> _Pass:
-    """Fit the estimated camera of an initial pass until the clock no longer moves.
-
-    Args:
-        best: the initial pass.
-        received: makes an initial pass with a given camera; None if no clock is found.
-    """
-    if best.context.camera.hypothesis is None:
-        return best
-    for _ in range(SETTINGS.max_fits):
-        camera, moved_slots = settle(best.context, best.acquisition, best.reception)
-        if moved_slots < SETTINGS.matters_slots:
-            best = best.with_camera(camera)
-            break
-        candidate = received(camera)
-        # If the evidence drops, the fit used wrong slots.
-        if candidate is None or candidate.evidence < SETTINGS.kept_evidence * best.evidence:
-            break
-        best = candidate
-    return best
 
 
 def _strips(context: FrameContext, profiles: RowProfiles) -> blind.Strips:

@@ -10,7 +10,8 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
+from rxcli.receiver.camera.settings import SETTINGS as camera_settings
+from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
 from rxcli.receiver.corners import proposed_screens
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
@@ -22,7 +23,7 @@ from rxcli.receiver.search.outlines import numbered
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
-from rxcli.receiver.unknown_camera import fitted
+from rxcli.receiver.unknown_camera import settle
 from rxcli.types import FloatArray, Frame
 
 _Cameras = Generator[list[Hypothesis], None, Failure | None]
@@ -130,15 +131,20 @@ class _Walk:
         return best if best is None or was_fitted else self._fitted(best)
 
     def _fitted(self, best: Scored) -> Scored:
-        """The same with its camera fitted to its slots, if the camera is an estimate."""
-
-        def received(camera: Camera) -> Scored | None:
+        """The same with an estimated camera fitted to its slots until the clock no longer moves."""
+        for _ in range(camera_settings.max_fits if best.context.camera.hypothesis else 0):
+            camera, moved_slots = settle(best.context, best.acquisition, best.reception)
+            if moved_slots < camera_settings.matters_slots:
+                return best.with_camera(camera)
             hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
             if hypothesis is None:
-                return None
-            return replace(self._measured(hypothesis, _acquired(hypothesis)), hypothesis=best.hypothesis)
-
-        return fitted(best, received)
+                break
+            candidate = replace(self._measured(hypothesis, _acquired(hypothesis)), hypothesis=best.hypothesis)
+            # If the evidence drops, the fit used wrong slots.
+            if candidate.evidence < camera_settings.kept_evidence * best.evidence:
+                break
+            best = candidate
+        return best
 
     def best_without_packets(self) -> Scored | None:
         """Hypothesis of the likeliest outline of a frame without packets, or None if the camera is not known."""
