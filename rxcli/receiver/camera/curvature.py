@@ -43,8 +43,9 @@ def straightened(strips: Strips, level: Float32Array, curvature: FloatArray) -> 
 
 
 def likeliest_bend(strips: Strips, level: Float32Array) -> FloatArray:
-    """(4,) bend, other than none, under which the levelled light (M, R) of neighbouring strips is most similar."""
+    """(4,) bend, other than none, under which the levelled light (M, R) of neighbouring columns is most similar."""
     # Lenses bend back further out: k2 is about -k1.
-    bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, 8)[:, None] * np.array([1.0, -1.0, 0.0, 0.0])
+    bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, 16)[:, None] * np.array([1.0, -1.0, 0.0, 0.0])
     straight = (straightened(strips, level, bend) for bend in bends)
-    return np.asarray(bends[np.argmax([(light[:-1] * light[1:]).sum() for light in straight])])
+    column = level.shape[0] // strips.n_columns
+    return np.asarray(bends[np.argmax([(light[:-column] * light[column:]).sum() for light in straight])])

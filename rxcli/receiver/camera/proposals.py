@@ -3,7 +3,7 @@
 Edges fall between slots, so their power has a spectral line at the rate of the slots; and columns repeat themselves a
 packet later. The periods that stand out so are scored by the correlation with the header. Read backwards, the header is
 its own complement, so the sign gives the direction of readout. The bend of the stripes is taken from the
-similarity of neighbouring strips; `fit` estimates it from the decoded slots.
+similarity of neighbouring columns; `fit` estimates it from the decoded slots.
 """
 
 from __future__ import annotations

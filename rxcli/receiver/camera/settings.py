@@ -35,7 +35,7 @@ class CameraSettings:
     min_rows_per_slot: float = 1.15
 
     #: Largest bend that is tried: k1 for a focal length of one picture width.
-    max_bend: float = 0.2
+    max_bend: float = 0.25
     #: Peaks that are tried: of the slots' line, and of the columns' copies for every length of packet.
     n_lines: int = 4
     n_copies: int = 4
