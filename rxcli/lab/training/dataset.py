@@ -24,7 +24,6 @@ from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput, network_inputs, payload_observed
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.search import search
-from rxcli.receiver.settings import STILL
 from rxcli.receiver.still import decode, doubtful_columns
 from rxcli.types import Clock, FloatArray
 
@@ -91,7 +90,7 @@ def validation_sample(number: int) -> Sample | None:
     """
     kind, turn = SCENE_CLASSES[number % len(SCENE_CLASSES)], number // len(SCENE_CLASSES)
     scene = validation_scene(kind, _SCREENS[turn % 2], turn // 2)
-    return _simulated(scene, _VALIDATION + number, STILL.beyond_repair_log_prob)
+    return _simulated(scene, _VALIDATION + number)
 
 
 def _cached(make: Callable[[int], Sample | None], n: int, folder: Path, what: str, progress: bool) -> Iterator[Sample]:
@@ -111,14 +110,14 @@ def _cached(make: Callable[[int], Sample | None], n: int, folder: Path, what: st
             yield sample
 
 
-def _simulated(simulated: SimulatedScene, seed: int, beyond_repair: float = -np.inf) -> Sample | None:
+def _simulated(simulated: SimulatedScene, seed: int) -> Sample | None:
     """One frame as a sample; None if the receiver finds no clock, a wrong one, or no doubtful column."""
     trial = simulate_trial(simulated, seed)
     found = search(trial.frame, trial.options(), Timer())
     if isinstance(found, Failure):
         return None
     reception = decode(found.best.acquisition, trial.options().skip)
-    scene, columns = reception.scene, doubtful_columns(reception, beyond_repair)
+    scene, columns = reception.scene, doubtful_columns(reception)
     if scene is None or not columns.size:
         return None
     slots = sent_slots(trial.capture.exposure, scene.clock)
