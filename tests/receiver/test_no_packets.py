@@ -44,7 +44,7 @@ def _first(headers: float) -> Reception:
     [
         (5.0, 0.1, frozenset(SKIPS), False),
         (90.0, 0.1, frozenset(SKIPS), True),
-        (5.0, 0.99, frozenset(SKIPS), True),
+        (5.0, 0.999, frozenset(SKIPS), True),
         (5.0, 0.1, frozenset(SKIPS) - {"no_packets"}, True),
     ],
 )

@@ -86,7 +86,7 @@ def test_columns_may_have_many_headers_in_common() -> None:
     """Two fifths of the slots of a packet of three symbols are its header."""
     rng = np.random.default_rng(2)
     light = np.sign(rng.normal(size=(20, 300))).astype(np.float32)
-    light[:, np.arange(300) % 5 < 3] = light[0, np.arange(300) % 5 < 3]
+    light[:, np.arange(300) % 10 < 7] = light[0, np.arange(300) % 10 < 7]
     weight = np.ones_like(light)
     assert is_common_light(light, weight, 0.0)
     assert not is_common_light(light, weight, 0.4)
