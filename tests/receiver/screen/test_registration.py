@@ -83,6 +83,16 @@ def test_stripes_are_not_followed() -> None:
         known.learn(frame, found)
 
 
+def test_stripes_on_a_flat_picture_seem_to_move_it_little() -> None:
+    flat = np.full((300, 520), 0.6, np.float32)
+    known = ScreenTexture(picture_of(flat, CORNERS, 1), CORNERS, None)
+    for seed in range(2, 5):
+        frame = picture_of(flat, CORNERS, seed)
+        found = known.find(frame)
+        assert np.abs(found.corners - CORNERS).max() < 2.2
+        known.learn(frame, found)
+
+
 def test_another_picture_fits_worse() -> None:
     known = known_of(texture(1))
     same, other = (known.find(picture_of(texture(seed), CORNERS, 9)).correlation for seed in (1, 2))
