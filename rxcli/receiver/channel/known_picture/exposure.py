@@ -13,15 +13,8 @@ from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
 def trusted(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
     """(C, R) reliability 0..1 of rows for learning, from the probabilities `lit` of their slots; see `SlotLight`."""
-    doubt = lit * (1 - lit)
-    each: IntArray = np.arange(len(lit))
-    if len(positions) == 1:  # equal for all certain columns
-        unsure = np.flatnonzero(doubt.max(axis=1) > SETTINGS.sure_probability)
-        each = np.zeros(len(lit), np.int64)
-        each[unsure] = 1 + np.arange(unsure.size)
-        doubt = np.concatenate([np.zeros_like(doubt[:1]), doubt[unsure]])
-    trust = np.clip(1 - 8 * SlotLight(doubt).mean_over(positions, exposure_slots), 0, 1)
-    return np.asarray(trust[each], np.float32)
+    doubt = SlotLight(lit * (1 - lit)).mean_over(positions, exposure_slots)
+    return np.asarray(np.clip(1 - 8 * doubt, 0, 1), np.float32)
 
 
 def read_between(values: FloatArray, place: FloatArray) -> FloatArray:

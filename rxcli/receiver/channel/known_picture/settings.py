@@ -57,8 +57,6 @@ class KnownPictureSettings:
 
     #: Distance of the blur taps, slots.
     side_slots: float = 0.5
-    #: Error probability below which a slot counts as certain.
-    sure_probability: float = 1e-4
 
     #: Row step for the signal-to-noise ratio of a column.
     snr_every_row: int = 5
