@@ -146,7 +146,7 @@ class Proposer:
         by_clock = _by_clock(outline, camera, self.options.screens)
         by_columns = {screen.columns: screen for screen in reversed(by_clock.pop(clock, []))}
         for columns, screen in by_columns.items():
-            if columns != n_columns:
+            if columns != n_columns and scored.evidence < SETTINGS.plain:
                 yield self._hypothesis(outline, camera, screen, log_prior, hypothesis.rows)
         if _is_clear(scored.reception):
             return
