@@ -318,8 +318,10 @@ class Ledger:
         """Results of the frames whose bursts all ended, oldest first."""
         done: list[FrameResult] = []
         while self._waiting and not self._n_held:
-            oldest, following = self._waiting[0], self._waiting[1] if len(self._waiting) > 1 else None
-            unsettled = following is None or (following.view is not None and following.numbers is None)
+            # Bursts may go on beyond frames that were passed over.
+            oldest, *later = (each for n, each in enumerate(self._waiting) if n == 0 or each.view is not None)
+            following = later[0] if later else None
+            unsettled = following is None or following.numbers is None
             if oldest.view is not None and (oldest.numbers is None or unsettled):
                 break
             done.append(self._report(self._waiting.popleft(), following))
