@@ -237,9 +237,8 @@ class KnownPicture:
 
     def _make(self) -> tuple[Float32Array, Float32Array]:
         wide, smooth = np.float32(SETTINGS.wide_weight), np.float32(SETTINGS.smooth_weight)
-        mean = np.float32(self._light.sum() / max(float(self._observed.sum()), 1e-6))
         near = box_sums(self._observed, SETTINGS.around_rows) + wide
-        around = (box_sums(self._light, SETTINGS.around_rows) + wide * mean) / near
+        around = (box_sums(self._light, SETTINGS.around_rows) + wide * self._wide()[:, None]) / near
         total = self._observed + smooth
         picture = np.maximum(self._light + smooth * around, 0) / total
         # Crosstalk alone is no observation of the picture, whose error may then be arbitrarily large.
@@ -250,6 +249,14 @@ class KnownPicture:
         error /= total * total
         error += np.float32(SETTINGS.min_error**2)
         return picture, error
+
+    def _wide(self) -> Float32Array:
+        """(C, R) mean of the picture over a column's strips and many rows."""
+        light, observed = (values.sum(axis=1) for values in (self._light, self._observed))
+        usual = light.sum() / max(float(observed.sum()), 1e-6)
+        some = np.float32(SETTINGS.wide_weight)
+        wide = (box_sums(light, SETTINGS.wide_rows) + some * usual) / (box_sums(observed, SETTINGS.wide_rows) + some)
+        return np.asarray(wide, np.float32)
 
     def _factor(self, measured: Float32Array | None = None) -> _System:
         """Factor the normal equations A m = b of every row, A symmetric with two bands: A = L D L', and diag(A^-1)."""

@@ -23,8 +23,9 @@ class KnownPictureSettings:
     #: Relative error of an interpolated picture, and of a well observed one.
     around_error: float = 0.6
     min_error: float = 0.02
-    #: Relative weight of the mean of the whole picture, used where the neighbouring rows were not lit either,
-    #: and its relative error, which is common to neighbouring rows.
+    #: Rows on each side, over all strips of a column, that provide the picture if the neighbouring rows were not lit
+    #: either; relative weight, and relative error, which is common to neighbouring rows.
+    wide_rows: int = 60
     wide_weight: float = 0.1
     wide_error: float = 2.0
     #: Squared error of the light of a row, relative to full light, times the rows of a slot, which share it: wrong
