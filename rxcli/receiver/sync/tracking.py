@@ -146,7 +146,7 @@ class LinkTime:
     def _frames_since(self, number: int, frame: int, elapsed_s: float) -> int:
         """Frame periods between two frames; dropped frames have no number but take time."""
         by_time = round(elapsed_s / self._frame_s) if np.isfinite(self._frame_s) and self._frame_s > 0 else 0
-        return max(by_time, frame - number)
+        return by_time or frame - number
 
     def _measure(self, frame: int, time_s: float, slot: float) -> None:
         assert self._last is not None
