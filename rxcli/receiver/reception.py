@@ -119,7 +119,10 @@ def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:
 
 def has_doubtful_packet(reception: Reception, certain: float) -> NDArray[np.bool_]:
     """(C,) whether a complete packet has a confidence below `certain`."""
-    return np.asarray(((reception.packet_confidence < certain) & complete_packets(reception)).any(axis=0))
+    doubtful = (reception.packet_confidence < certain) & (
+        reception.posteriors.log_prob.min(axis=2) < SETTINGS.beyond_doubt_log_prob
+    )
+    return np.asarray((doubtful & complete_packets(reception)).any(axis=0))
 
 
 def complete_packets(reception: Reception) -> NDArray[np.bool_]:

@@ -23,6 +23,8 @@ class WiringSettings:
     max_period_rows: int = 100
     switched_share: float = 0.7
 
+    #: Log probability of all symbols from which a column is certain without regard to single slots.
+    beyond_doubt_log_prob: float = -1e-3
     #: Log-likelihood below the best weight at which a weight is dropped.
     weight_margin: float = 20.0
     #: Log-likelihood ratio from which a column has packets even without a header; wrong clocks reach 74.
@@ -45,8 +47,8 @@ class StillSettings:
     #: Samples per slot of the first passes, and of later passes over doubtful columns.
     coarse_samples: int = 2
     fine_samples: int = 4
-    #: Confidence below which a column gets further passes.
-    doubtful: float = 0.99
+    #: Confidence below which a column with a symbol below `beyond_doubt_log_prob` gets further passes.
+    doubtful: float = 0.985
     #: Limit of strip slots for the network, which takes most of the time; the least certain columns are left out.
     max_network_slots: int = 100_000
 
