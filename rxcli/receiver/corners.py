@@ -12,6 +12,7 @@ from rxcli.receiver.cameras import known_lens
 from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
 from rxcli.receiver.plane import turned
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen.bright import bright_quadrilateral
 from rxcli.receiver.screen.find import (
     BRIGHTEN,
     ColumnLayout,
@@ -27,6 +28,9 @@ from rxcli.types import FloatArray, Frame
 _TOO_SLOW = (
     "the screen may have no profile here (vlc-rx profiles lists them); else use a faster slot rate or shorter packets"
 )
+#: Log-odds of the bright part of a picture against columns that were found; probability that it is the whole screen, if
+#: it shows packets; and the share of its width within which corners are the same.
+_BRIGHT_LOG_ODDS, _BRIGHT_CERTAINTY, _SAME_OUTLINE = -50.0, 0.9, 0.025
 #: Orientations in which the readout runs along the columns' width.
 _PORTRAIT = (5, 6, 7, 8)
 _NO_COLUMNS = "no columns of a modulated backlight were found in the picture"
@@ -75,7 +79,24 @@ def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
         )
         return _as_viewed(found, frame.metadata.orientation)
 
-    return [[outline(candidate) for candidate in screen] for screen in screens]
+    outlines = [[outline(candidate) for candidate in screen] for screen in screens]
+    if len(outlines) == 1:
+        outlines[0] += _bright_outline(frame, outlines[0], timer)
+    return outlines
+
+
+def _bright_outline(frame: Frame, found: list[Outline], timer: Timer) -> list[Outline]:
+    """The outline of the bright part of the picture, unless it is one of those that were found."""
+    with timer("geometry"):
+        corners = bright_quadrilateral(timer.planes.plane(frame))
+    if corners is None:
+        return []
+    bright = _as_viewed(
+        Outline(corners, _BRIGHT_CERTAINTY, log_odds=_BRIGHT_LOG_ODDS, family=0), frame.metadata.orientation
+    )
+    tolerance = _SAME_OUTLINE * np.ptp(corners[:, 0])
+    is_found = any(np.abs(outline.corners - bright.corners).max() < tolerance for outline in found)
+    return [] if is_found else [bright]
 
 
 def layouts_of(options: ReceiverOptions) -> list[ColumnLayout]:

@@ -40,7 +40,7 @@ def numbered(own: Outline, outlines: Sequence[Outline], score_of: Callable[[int]
     families = {outline.family for outline in outlines}
     scores = np.array([score for family in families if (score := score_of(family)) is not None])
     mine = score_of(own.family)
-    certainty = 1 / float(np.exp(np.sort(family_odds) - own.log_odds).sum())
+    certainty = own.certainty / float(np.exp(np.sort(family_odds) - own.log_odds).sum())
     if mine is not None:
         certainty /= float(np.exp(np.sort(scores) - mine).sum())
     return replace(

@@ -1,0 +1,57 @@
+"""A bright screen whose picture hides the columns' borders: its outline is where it is bright."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from rxcli.lab.benchmark.trial import simulate_trial
+from rxcli.lab.simulate.scenes import preset
+from rxcli.options import ReceiverOptions
+from rxcli.receiver.pipeline import receive_frame
+from rxcli.receiver.plane import read_plane
+from rxcli.receiver.screen.bright import bright_quadrilateral
+from rxcli.types import Frame
+
+CORNERS = np.array([[210.0, 120.0], [1390.0, 160.0], [1370.0, 860.0], [190.0, 800.0]])
+
+
+def picture_of(corners: np.ndarray, level: int = 200, dark: tuple[slice, slice] | None = None) -> Frame:
+    pixels = np.full((1000, 1600), 20, np.uint8)
+    cv2.fillConvexPoly(pixels, np.round(corners).astype(np.int32), level)
+    if dark is not None:
+        pixels[dark] = 20
+    return Frame(pixels, "drawn")
+
+
+@pytest.mark.parametrize("dark", [None, (slice(400, 500), slice(600, 700)), (slice(0, 180), slice(0, 300))])
+def test_corners_of_a_bright_part(dark: tuple[slice, slice] | None) -> None:
+    found = bright_quadrilateral(read_plane(picture_of(CORNERS, dark=dark)))
+    assert found is not None
+    np.testing.assert_allclose(found, CORNERS, atol=12)
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        np.array([[800.0, 500.0], [1000.0, 500.0], [1000.0, 660.0], [800.0, 660.0]]),
+        np.array([[800.0, 20.0], [1500.0, 900.0], [1500.0, 901.0], [100.0, 900.0]]),
+    ],
+    ids=["small", "triangle"],
+)
+def test_what_is_no_screen(corners: np.ndarray) -> None:
+    assert bright_quadrilateral(read_plane(picture_of(corners))) is None
+
+
+def test_a_checkerboard_is_received() -> None:
+    scene = preset("xs10-still", "paper-17k3").scaled(0.5, keep_readout=True)
+    checks = np.kron(np.indices((16, 28)).sum(axis=0) % 2, np.ones((24, 24), int))[..., None] * np.uint8([200] * 3)
+    scene = replace(scene, picture=checks.astype(np.uint8), light_e_per_s=2 * scene.light_e_per_s)
+    trial = simulate_trial(replace(scene, pose=replace(scene.pose, fill=0.75)), 3)
+    result = receive_frame(trial.frame, ReceiverOptions())
+    sent = {payload for burst in trial.truth.payload.values() for payload in burst}
+    assert sum(packet.payload in sent for packet in result.packets) >= 15
+    assert max(packet.confidence for packet in result.packets) <= 0.9
