@@ -86,7 +86,7 @@ def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
 
 
 def _bright_outline(frame: Frame, found: list[Outline], timer: Timer) -> list[Outline]:
-    """The outline of the bright part of the picture, unless it is one of those that were found."""
+    """The outline of the bright part of the picture, unless it was found already."""
     with timer("geometry"):
         corners = bright_quadrilateral(timer.planes.plane(frame))
     if corners is None:
