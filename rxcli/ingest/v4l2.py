@@ -2,8 +2,7 @@
 
 The kernel interface is used directly. OpenCV hides why a camera cannot be opened, takes another pixel format unasked,
 and gives no times. FFmpeg's input (through PyAV) gives times, but sets neither exposure nor gain, lists modes to its
-log alone, takes YUYV where 10 or 12 bits are asked for, counts no frames that the driver dropped, and cannot be stopped
-while a camera is silent.
+log alone, and takes YUYV where 10 or 12 bits are asked for.
 """
 
 from __future__ import annotations
