@@ -90,3 +90,10 @@ def test_columns_may_have_many_headers_in_common() -> None:
     weight = np.ones_like(light)
     assert is_common_light(light, weight, 0.0)
     assert not is_common_light(light, weight, 0.4)
+
+
+def test_a_few_lit_columns_side_by_side_are_no_single_lamp() -> None:
+    """Most of a dark picture's columns are noise, so few lit ones lie far apart."""
+    trial = simulate_trial(replace(preset("xs10-still", "paper-17k3"), picture="flower"), 1)
+    (result,) = receive([trial.frame], trial.options())
+    assert len(result.packets) >= 5

@@ -48,8 +48,9 @@ def is_common_light(value: Float32Array, weight: Float32Array, shared: float, re
         reach: largest shift between columns, samples.
     """
     n_columns, n = value.shape
-    # Columns half the screen apart share no light.
-    column_a, column_b = np.triu_indices(n_columns, max(n_columns // 2, 2))
+    column_a, column_b = np.triu_indices(
+        n_columns, max(SETTINGS.distant_columns, int(SETTINGS.distant_share * n_columns))
+    )
     if column_a.size == 0:
         return False
     chosen = np.linspace(0, column_a.size - 1, min(column_a.size, _MAX_PAIRS)).astype(np.int64)
