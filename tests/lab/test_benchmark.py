@@ -17,6 +17,7 @@ from click.testing import CliRunner
 
 from rxcli.cli.benchmark import benchmark
 from rxcli.errors import InputError, ReceiverError, UsageError
+from rxcli.ingest import open_source
 from rxcli.lab.benchmark import cases, compare, measures, quick, runner, tables
 from rxcli.lab.benchmark.cases import Case, received
 from rxcli.lab.benchmark.draw import Place, binned, draw_nodata, draw_small
@@ -343,6 +344,12 @@ def test_a_checkout_that_breaks_off_is_told(tmp_path: Path) -> None:
     (package / "main.py").write_text("raise RuntimeError('out of order')\n")
     with pytest.raises(ReceiverError, match="out of order"):
         compare.compare([], compare.check_checkout(tmp_path), tmp_path, 1, lambda: None)
+
+
+def test_frames_without_data_are_compared_as_a_clip(tmp_path: Path) -> None:
+    case = next(iter(draw_nodata(Place(3, 0, {"n_frames": 3}, tmp_path))))
+    path = Path(compare.arguments_of(case, tmp_path / "case")[1])
+    assert len(list(open_source(path))) == len(case.source) == 3
 
 
 def test_a_changed_receiver_is_found_out(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from rxcli.lab.benchmark.cases import Case, Record
 from rxcli.lab.benchmark.draw import DRAWERS, Place
 from rxcli.lab.benchmark.measures import Row
 from rxcli.lab.benchmark.runner import CHECKOUT, Task
-from rxcli.lab.simulate.files import write_dng
+from rxcli.lab.simulate.files import write_dng, write_video
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.outputs import write_whole
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile
@@ -73,10 +73,15 @@ def arguments_of(case: Case, stem: Path) -> list[str]:
 
 
 def _written(case: Case, stem: Path) -> Path:
-    """The case's file: a copy, a JPEG or DNG where one was simulated, or else a PNG."""
+    """The case's file: a copy, a clip of several frames, a JPEG or DNG where one was simulated, or else a PNG."""
     if isinstance(case.source, Path):
         return Path(shutil.copyfile(case.source, stem.with_suffix(case.source.suffix)))
     frame, trial = case.source[0], case.trial
+    if len(case.source) > 1:
+        path = stem.with_suffix(".mp4")
+        pictures = (cv2.cvtColor(np.asarray(each.pixels), cv2.COLOR_GRAY2RGB) for each in case.source)
+        write_video(pictures, path, "h264", 1 / (case.source[1].time_s - frame.time_s))
+        return path
     if trial is None or frame is not trial.frame:
         # A picture that was changed after its simulation is stored anew, without metadata.
         path = stem.with_suffix(".png")
