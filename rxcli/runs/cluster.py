@@ -135,8 +135,9 @@ def _tapping_into(decoder: Decoder, option: str, folder: Path) -> Decoder:
     """The decoder with the taps of one option in another folder."""
     if option == "--dump-dir":
         return replace(decoder, options=replace(decoder.options, dump_dir=folder))
-    tap: Any = decoder.tap
-    return replace(decoder, tap=replace(tap, folder=folder))
+    writer: Any = decoder.tap
+    writer = replace(writer, folder=folder)
+    return replace(decoder, tap=writer, after=decoder.after and writer.finish)
 
 
 def _write(taps: list[_Tap], decoder: Decoder) -> None:

@@ -23,7 +23,7 @@ from rxcli.results.record import to_json_line
 from rxcli.runs import cluster
 from rxcli.runs.batch import Source, decode_here
 from rxcli.runs.cluster import decode_on_cluster
-from rxcli.types import Frame
+from rxcli.types import Frame, FrameResult
 
 pytest.importorskip("distributed", reason="dask.distributed is not installed (extra cluster)")
 
@@ -135,7 +135,7 @@ KINDS = (("straight", ".00000.png"), ("taps", "-000000.npz"))
 
 @dataclass(frozen=True)
 class Writer:
-    """Writes 3 MB for every frame."""
+    """Writes 3 MB for every frame, and a line when its result comes."""
 
     folder: Path
 
@@ -143,14 +143,18 @@ class Writer:
         self.folder.mkdir()
         (self.folder / "a.png").write_bytes(bytes(3 << 20))
 
+    def finish(self, result: FrameResult, subfolder: str) -> None:
+        (self.folder / "b.png").write_bytes(b"late")
+
 
 def test_taps_come_back_with_the_results_unless_they_are_too_large(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source, decoder = write_orders(tmp_path)[0], replace(fake_decoder(), tap=Writer(tmp_path / "there"))
+    writer = Writer(tmp_path / "there")
+    source, decoder = write_orders(tmp_path)[0], replace(fake_decoder(), tap=writer, after=writer.finish)
     results, taps = cluster._decode(decoder, source)
     assert [result.status for result in results] == ["ok"]
-    assert taps == [("--save-undistorted/a.png", bytes(3 << 20))]
+    assert taps == [("--save-undistorted/a.png", bytes(3 << 20)), ("--save-undistorted/b.png", b"late")]
     assert not (tmp_path / "there").exists()
     monkeypatch.setattr(cluster, "_MAX_TAPPED", 1 << 20)
     with pytest.raises(OutputError, match=r"00\.jpg: its taps take 3 MB; a cluster sends at most 1 MB"):
