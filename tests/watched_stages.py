@@ -12,9 +12,10 @@ from types import ModuleType
 from typing import Any
 
 from rxcli.lab.benchmark.cases import problems_in
-from rxcli.receiver import channel, plane, sync
+from rxcli.receiver import channel, plane
 from rxcli.receiver.decode import detect
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.sync import clock as sync
 
 STAGES = (geometry, plane, sync, channel, detect)
 

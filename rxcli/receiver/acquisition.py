@@ -9,9 +9,10 @@ import numpy as np
 
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import camera as blind
-from rxcli.receiver import plane, sync
+from rxcli.receiver import plane
 from rxcli.receiver.context import FrameContext
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.sync import clock as sync
 from rxcli.types import Clock, FloatArray, IntArray, Outlines, RowProfiles
 
 #: Outlines of one frame that are kept.

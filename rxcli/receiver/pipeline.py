@@ -15,7 +15,6 @@ from typing import Any
 from rxcli.numerics import one_blas_thread
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.context import Failure, Outline, Timer
 from rxcli.receiver.corners import proposed_screens, too_small
@@ -23,6 +22,7 @@ from rxcli.receiver.decode import assemble
 from rxcli.receiver.reception import Reception, headerless, slot_margin, soft_bits
 from rxcli.receiver.search import search
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
+from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.unknown_camera import settle
 from rxcli.results.dump import dump_stages
 from rxcli.types import FloatArray, Frame, FrameResult

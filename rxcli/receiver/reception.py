@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
-from rxcli.receiver import channel, sync
+from rxcli.receiver import channel
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.decode.soft_bits import assume_unobserved_certain, still_soft_bits
 from rxcli.receiver.decode.steady import is_steady
 from rxcli.receiver.settings import SETTINGS
+from rxcli.receiver.sync import clock as sync
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, SlotSamples
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rxcli.errors import ReceiverError
 from rxcli.options import ReceiverOptions
-from rxcli.receiver import channel, sync
+from rxcli.receiver import channel
 from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import detect
@@ -26,6 +26,7 @@ from rxcli.receiver.reception import (
     word_log_prob,
 )
 from rxcli.receiver.settings import SETTINGS, STILL
+from rxcli.receiver.sync import clock as sync
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
 
 

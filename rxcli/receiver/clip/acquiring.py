@@ -17,7 +17,6 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver import sync
 from rxcli.receiver.acquisition import (
     Acquisition,
     ColumnSampler,
@@ -30,6 +29,7 @@ from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.context import Camera, FrameContext, Timer
 from rxcli.receiver.screen.registration import ScreenTexture
 from rxcli.receiver.search import search
+from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.receiver.sync.tracking import LinkTime
 from rxcli.types import Clock, FloatArray, Frame, RowProfiles

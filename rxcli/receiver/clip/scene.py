@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.receiver import plane, sync
+from rxcli.receiver import plane
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.channel import SlotLikelihoods, known_picture
 from rxcli.receiver.clip.settings import SETTINGS
@@ -18,6 +18,7 @@ from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.sampling import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
+from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.sync import tracking
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray, RowProfiles
 

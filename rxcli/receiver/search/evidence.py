@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.light import slot_llr
 from rxcli.receiver.reception import Reception, complete_packets
 from rxcli.receiver.search.settings import SETTINGS
+from rxcli.receiver.sync import clock as sync
 
 #: Columns of the screen that evidence is scaled to: narrower columns show the same light several times.
 _COLUMNS = 20

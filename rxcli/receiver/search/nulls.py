@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS
-from rxcli.receiver import sync
 from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.corners import too_small
@@ -14,6 +13,7 @@ from rxcli.receiver.decode.steady import is_common_light, periodic_share
 from rxcli.receiver.reception import shows_steady_light
 from rxcli.receiver.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
+from rxcli.receiver.sync import clock as sync
 from rxcli.types import RowProfiles
 
 _NEXT = "point the camera at the screen that sends, or check that it does"

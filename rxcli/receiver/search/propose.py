@@ -9,7 +9,6 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver import sync
 from rxcli.receiver.acquisition import ColumnSampler, noise_of, sample_columns, variants_of
 from rxcli.receiver.cameras import known_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
@@ -19,6 +18,7 @@ from rxcli.receiver.reception import Reception, complete_packets
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.outlines import likeliest_of_family
 from rxcli.receiver.search.settings import SETTINGS
+from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.unknown_camera import propose_cameras, relabelled_camera
 from rxcli.types import Clock, Frame
 

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from row_profiles import Link, Shot, random_link, row_profiles, sigma_of, slot_odds
 
 from rxcli.protocol import slot_patterns
-from rxcli.receiver import channel, sync
+from rxcli.receiver import channel
 from rxcli.receiver.channel.patterns import by_pattern
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
+from rxcli.receiver.sync import clock as sync
 from rxcli.types import Clock, SlotSamples
 
 FloatArray = NDArray[np.float64]

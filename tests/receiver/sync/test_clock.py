@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_of
 
 from rxcli.protocol import encode_packet
-from rxcli.receiver import channel, sync
+from rxcli.receiver import channel
 from rxcli.receiver.decode import detect
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, slot_llr
+from rxcli.receiver.sync import clock as sync
 from rxcli.types import BurstPosteriors, Clock, RowProfiles, SlotSamples
 
 FloatArray = NDArray[np.float64]
