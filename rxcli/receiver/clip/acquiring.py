@@ -181,7 +181,7 @@ def _response(profiles: RowProfiles, rows_per_slot: float) -> tuple[FloatArray, 
     pooled, weight = sync.contrast(
         light, valid, sync_settings.search_samples, noise_of(profiles) / np.sqrt(max(step, 1.0))
     )
-    response = sync.header_response(pooled, weight, sync_settings.search_samples)
+    response = sync.header_response(pooled, weight, sync_settings.search_samples).mean(axis=0)
     return top / rows_per_slot + np.arange(response.size) / sync_settings.search_samples, np.maximum(response, 0) ** 2
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.numerics import TINY, folded, header_correlation
-from rxcli.protocol import EXTREMES_SLOTS, HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.protocol import EXTREMES_SLOTS, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
@@ -168,21 +168,14 @@ def contrast(
 
 
 def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot: int) -> FloatArray:
-    """(n,) float64 correlation of the columns' mean with a header that starts at each sample.
+    """(C, n) float64 correlation of every column with a header that starts at each sample.
 
     Slots outside the samples contribute nothing.
     """
-    share = weight / (weight + 1.0)
-    mean = (pooled * share).sum(axis=0) / max(pooled.shape[0], 1)
-    return np.asarray(_header_correlation(mean[None], samples_per_slot)[0])
-
-
-def _header_correlation(values: NDArray[np.floating], samples_per_slot: int) -> FloatArray:
-    """(n, samples) mean over the slots of a header that starts at each sample, dark slots negated."""
-    total = np.cumsum(values, axis=1, dtype=np.float64)
+    total = np.cumsum(pooled * (weight / (weight + 1.0)), axis=1, dtype=np.float64)
     padded = np.pad(total, ((0, 0), (1, 0)))
-    length = SLOTS_PER_SYMBOL * samples_per_slot
-    return header_correlation(np.pad(padded, ((0, 0), (0, length - 1)), mode="edge"), samples_per_slot)
+    after = SLOTS_PER_SYMBOL * samples_per_slot - 1
+    return header_correlation(np.pad(padded, ((0, 0), (0, after)), mode="edge"), samples_per_slot)
 
 
 def find_clock(
@@ -205,18 +198,20 @@ def find_clock(
     light, valid = resample(profiles, top, step, n)
     pooled, weight = contrast(light, valid, SETTINGS.search_samples, sigma / np.sqrt(max(step, 1.0)))
     response = header_response(pooled, weight, SETTINGS.search_samples)
-    power = folded(np.maximum(response, 0) ** 2, packet_slots * SETTINGS.search_samples)
+    period = packet_slots * SETTINGS.search_samples
+    power = folded(np.maximum(response.mean(axis=0), 0) ** 2, period)
     start, header_peak_ratio = header_comb(power, SETTINGS.search_samples)
     if not np.isfinite(start):
         return None
-    delays = _delays(pooled, weight, start, packet_slots)
+    by_column = folded(response, period)
+    delays = _delays(by_column, start)
     many_delays = np.count_nonzero(delays) > delays.size * SETTINGS.many_columns
     if header_peak_ratio < SETTINGS.clear_header_lead or many_delays:
-        staggered_start, staggered_ratio, staggered_delays = _staggered_comb(
-            pooled, weight, packet_slots * SETTINGS.search_samples
-        )
+        staggered_start, staggered_ratio = _staggered_comb(by_column)
         if staggered_ratio > header_peak_ratio or many_delays:
-            start, delays = staggered_start, staggered_delays
+            delays = _delays(by_column, staggered_start)
+            middle = float(np.median(delays))
+            start, delays = staggered_start + middle * SETTINGS.search_samples, delays - middle
             header_peak_ratio = max(header_peak_ratio, staggered_ratio)
     row0 = top + start * step
     before = int(np.ceil((row0 - top) / rows_per_slot))
@@ -272,60 +267,35 @@ def _rival(score: FloatArray, best: int, samples_per_slot: int, further: int = 0
     return max(float(away.max(initial=0.0)), TINY)
 
 
-def _staggered_comb(pooled: Float32Array, weight: Float32Array, period: int) -> tuple[float, float, FloatArray]:
-    """Start, lead and delays of columns whose delays are too different for their mean to show a header.
+def _staggered_comb(by_column: FloatArray) -> tuple[float, float]:
+    """Start and lead of columns whose delays are too different for their mean to show a header.
 
-    Folds each column's own header correlation; the start is where most columns have a peak within reach.
+    The start is where most columns have a peak within reach; `by_column` as for `_delays`.
     """
     import cv2
 
-    n_columns = pooled.shape[0]
-    length = SLOTS_PER_SYMBOL * SETTINGS.search_samples
-    share = np.pad(weight / (weight + 1.0), ((0, 0), (0, length - 1)))
-    total = np.cumsum(np.pad(share, ((0, 0), (1, 0))), axis=1)
-    bound = (total[:, length:] - total[:, :-length]) / length
-    responses = _header_correlation(pooled * (weight / (weight + 1.0)), SETTINGS.search_samples)
-    # Twice the correlation minus its bound is proportional to the log-likelihood ratio against random slots.
-    llr = folded(2 * responses - bound, period)
     reach = int(SETTINGS.max_delay_slots * SETTINGS.search_samples)
-    wide = reach + SETTINGS.search_samples
-    wrapped = np.pad(llr, ((0, 0), (wide, wide)), mode="wrap")
-    near = cv2.dilate(wrapped, np.ones((1, 2 * reach + 1), np.uint8))[:, wide : wide + period]
-    score = np.maximum(near, 0).sum(axis=0)
+    wrapped = np.pad(by_column, ((0, 0), (reach, reach)), mode="wrap")
+    near = cv2.dilate(wrapped, np.ones((1, 2 * reach + 1), np.uint8))[:, reach:-reach]
+    score = (np.maximum(near, 0) ** 2).sum(axis=0)
     start = int(score.argmax())
-    header_peak_ratio = score[start] / _rival(score, start, SETTINGS.search_samples, 2 * reach)
-    around = wrapped[:, start : start + 2 * wide + 1]
-    best = around.argmax(axis=1)
-    delays = best + _parabola(around, best) - wide
-    sure = around[np.arange(n_columns), best] > 0
-    middle = float(np.median(delays[sure])) if sure.any() else 0.0
-    return (
-        (start + middle) % period,
-        float(header_peak_ratio),
-        np.where(sure, delays - middle, 0.0) / SETTINGS.search_samples,
-    )
+    return float(start), float(score[start] / _rival(score, start, SETTINGS.search_samples, 2 * reach))
 
 
-def _delays(pooled: Float32Array, weight: Float32Array, start: float, packet_slots: int) -> FloatArray:
-    """Delay of each column against the common clock, slots; 0 where it is not significant."""
-    reach = int(SETTINGS.max_delay_slots * SETTINGS.search_samples) + 2
-    template = np.repeat(2.0 * np.array(HEADER) - 1, SETTINGS.search_samples) / (
-        SLOTS_PER_SYMBOL * SETTINGS.search_samples
-    )
-    share = weight / (weight + 1.0)
-    n = pooled.shape[1]
-    starts = np.arange(round(start), n, packet_slots * SETTINGS.search_samples)
-    index = starts[:, None, None] + np.arange(-reach, reach + 1)[:, None] + np.arange(template.size)
-    observed = (index >= 0) & (index < n)
-    signal = (pooled * share)[:, np.clip(index, 0, n - 1)] * observed
-    score = (signal * template).sum(axis=(1, 3))
-    best = score.argmax(axis=1)
+def _delays(by_column: FloatArray, start: float) -> FloatArray:
+    """Delay of each column against the common clock, slots; 0 where it is not significant.
+
+    Args:
+        by_column: (C, period) header correlation of every column, copies added.
+        start: of packets, samples.
+    """
+    reach = int((SETTINGS.max_delay_slots + 1) * SETTINGS.search_samples)
+    score = by_column.take(round(start) + np.arange(-reach, reach + 1), axis=1, mode="wrap")
+    best, top = score.argmax(axis=1), score.max(axis=1)
     fine = (best + _parabola(score, best) - reach - (start - round(start))) / SETTINGS.search_samples
-    top = score[np.arange(best.size), best]
     strong = top > 0.5 * np.median(top)
-    scattered = (
-        np.mean(np.abs(fine[strong]) > SETTINGS.same_delay_slots) > SETTINGS.many_columns if strong.any() else False
-    )
+    late = strong & (np.abs(fine) > SETTINGS.same_delay_slots)
+    scattered = np.count_nonzero(late) > SETTINGS.many_columns * np.count_nonzero(strong)
     moved = (top - score[:, reach] > SETTINGS.delay_lead) | scattered
     return np.where(moved & strong & (best > 0) & (best < 2 * reach), fine, 0.0)
 
