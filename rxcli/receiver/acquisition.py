@@ -62,12 +62,13 @@ class Acquisition:
         """The acquisition with strips binned in pairs."""
         return replace(self, sampler=ColumnSampler(self.sampler.binned, self.sampler.binned))
 
-    def middle(self) -> Acquisition:
-        """The acquisition of the middle half of the columns, strips binned in pairs."""
+    @property
+    def middle_columns(self) -> IntArray:
+        """Numbers of the middle half of the columns."""
         n_columns = self.screen.columns
-        return self.of_columns(slice(n_columns // 4, n_columns - n_columns // 4))
+        return np.arange(n_columns // 4, n_columns - n_columns // 4)
 
-    def of_columns(self, part: slice) -> Acquisition:
+    def of_columns(self, part: IntArray | slice) -> Acquisition:
         """The acquisition of some columns, strips binned in pairs."""
         chosen = self.sampler.binned.of_columns(part)
         clock = replace(self.clock, delay_slots=self.clock.delay_slots[part])

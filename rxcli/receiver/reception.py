@@ -16,7 +16,7 @@ from rxcli.receiver.decode.soft_bits import assume_unobserved_certain, still_sof
 from rxcli.receiver.decode.steady import is_steady
 from rxcli.receiver.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, SlotSamples
+from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, IntArray, SlotSamples
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,18 @@ class Reception:
     def scene(self) -> denoise.DenoiserInput | None:
         """Input of the auto-encoder; None if no column was doubtful."""
         return None if self.cleaned is None else self.scene_of(*self.cleaned)
+
+    def of_columns(self, columns: IntArray) -> Reception:
+        """The reception of some columns."""
+        return replace(
+            self,
+            clock=replace(self.clock, delay_slots=self.clock.delay_slots[columns]),
+            samples=self.samples.of_columns(columns),
+            posteriors=self.posteriors.of_columns(columns),
+            snr=self.snr[columns],
+            metrics=self.metrics[columns],
+            cleaned=None,
+        )
 
     def scene_of(self, samples: SlotSamples, model: channel.ObservationModel) -> denoise.DenoiserInput:
         """Samples of all columns with their current decisions."""

@@ -9,7 +9,7 @@ similarity of neighbouring columns; `fit` estimates it from the decoded slots.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -45,6 +45,8 @@ class CameraHypothesis:
     exposure_slots_sd: float = 0.0
     #: Exposure that the file states, 0 where it does not: the least there can be.
     stated_exposure_slots: float = 0.0
+    #: Number among the proposals for a picture, the best first; a fit keeps it.
+    number: int = 0
 
 
 def propose(
@@ -77,7 +79,7 @@ def propose(
     distinct: list[CameraHypothesis] = []
     for hypothesis in sorted(found, key=lambda clock: -clock.score):
         if len(distinct) < SETTINGS.n_proposed and not any(_is_same(hypothesis, better) for better in distinct):
-            distinct.append(hypothesis)
+            distinct.append(replace(hypothesis, number=len(distinct)))
     return distinct
 
 

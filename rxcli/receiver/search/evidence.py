@@ -8,6 +8,7 @@ from rxcli.numerics import TINY
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.light import slot_llr
 from rxcli.receiver.reception import Reception, complete_packets
+from rxcli.receiver.search.hypothesis import Scored
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
 
@@ -44,6 +45,13 @@ def score(reception: Reception, acquisition: Acquisition, evidence: float, log_p
         similarity = (own[0] if own else possible[-1][1]) - possible[0][1]
     gain = SETTINGS.complete_packet * complete + SETTINGS.copies_weight * similarity
     return SETTINGS.temper * (packets * evidence + gain) + log_prior
+
+
+def middle_score(scored: Scored) -> float:
+    """Score of the middle half of the columns of a hypothesis."""
+    acquisition, log_prior = scored.acquisition, scored.hypothesis.log_prior
+    middle = scored.reception.of_columns(acquisition.middle_columns)
+    return score(middle, acquisition, log_evidence(middle), log_prior)
 
 
 def distinct_share(reception: Reception) -> float:

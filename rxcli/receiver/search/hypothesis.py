@@ -37,13 +37,11 @@ class Hypothesis:
     @property
     def identity(self) -> tuple[object, ...]:
         """Equal for hypotheses that an initial pass cannot distinguish; also the order of ties."""
-        camera = self.camera
+        estimate = self.camera.hypothesis
         return (
             self.outline.family,
             self.rows,
-            round(camera.line_delay_s * self.screen.slot_rate_hz, 9),
-            camera.reversed,
-            camera.lens is not None,
+            estimate.number if estimate else 0,
             self.screen.packet_slots,
             self.screen.columns,
             self.screen.slot_rate_hz,

@@ -198,11 +198,16 @@ class _Walk:
         return (self._fresh, heapq.heappop(self._fresh)) if self._fresh else None
 
     def _score(self, hypothesis: Hypothesis) -> None:
-        """Make an initial pass; if there is a better hypothesis already, of the middle columns first."""
+        """Make an initial pass; if there is a better hypothesis already, of the middle columns first.
+
+        The others follow if the middle ones come near the best score; if that is beyond doubt, if they beat its own.
+        """
         best, acquisition = self._best(), _acquired(hypothesis)
         if best is not None and hypothesis.screen.columns > SETTINGS.few_columns:
-            half = self._measured(hypothesis, acquisition.middle())
-            if half.score < best.score - SETTINGS.reach or half.evidence < min(SETTINGS.bail, best.evidence):
+            half = self._measured(hypothesis, acquisition.of_columns(acquisition.middle_columns))
+            is_plain = best.evidence > SETTINGS.plain
+            least = evidence.middle_score(best) if is_plain else best.score - SETTINGS.reach
+            if half.score < least or half.evidence < min(SETTINGS.bail, best.evidence):
                 self._tried.append(Tried(hypothesis, half.evidence, half.score, "half"))
                 return
         scored = self._measured(hypothesis, acquisition)

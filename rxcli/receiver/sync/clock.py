@@ -190,6 +190,8 @@ def find_clock(
         packet_slots: slots of a packet.
         sigma: standard deviation of a dark row of a strip.
     """
+    import cv2
+
     top, bottom = _row_span(profiles)
     step = rows_per_slot / SETTINGS.search_samples
     n = int((bottom - top) / step)
@@ -203,15 +205,19 @@ def find_clock(
     start, header_peak_ratio = header_comb(power, SETTINGS.search_samples)
     if not np.isfinite(start):
         return None
-    by_column = folded(response, period)
+    # Twice the correlation less the contrast is proportional to the log-likelihood ratio against random slots.
+    length = SLOTS_PER_SYMBOL * SETTINGS.search_samples
+    share = cv2.blur(weight / (weight + 1), (length, 1), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
+    by_column = folded(2 * response - share, period)
     delays = _delays(by_column, start)
     many_delays = np.count_nonzero(delays) > delays.size * SETTINGS.many_columns
     if header_peak_ratio < SETTINGS.clear_header_lead or many_delays:
         staggered_start, staggered_ratio = _staggered_comb(by_column)
         if staggered_ratio > header_peak_ratio or many_delays:
             delays = _delays(by_column, staggered_start)
-            middle = float(np.median(delays))
-            start, delays = staggered_start + middle * SETTINGS.search_samples, delays - middle
+            middle = float(np.median(delays[delays != 0])) if delays.any() else 0.0
+            start = staggered_start + middle * SETTINGS.search_samples
+            delays = np.where(delays != 0, delays - middle, 0.0)
             header_peak_ratio = max(header_peak_ratio, staggered_ratio)
     row0 = top + start * step
     before = int(np.ceil((row0 - top) / rows_per_slot))
@@ -277,7 +283,7 @@ def _staggered_comb(by_column: FloatArray) -> tuple[float, float]:
     reach = int(SETTINGS.max_delay_slots * SETTINGS.search_samples)
     wrapped = np.pad(by_column, ((0, 0), (reach, reach)), mode="wrap")
     near = cv2.dilate(wrapped, np.ones((1, 2 * reach + 1), np.uint8))[:, reach:-reach]
-    score = (np.maximum(near, 0) ** 2).sum(axis=0)
+    score = np.maximum(near, 0).sum(axis=0)
     start = int(score.argmax())
     return float(start), float(score[start] / _rival(score, start, SETTINGS.search_samples, 2 * reach))
 
@@ -286,18 +292,18 @@ def _delays(by_column: FloatArray, start: float) -> FloatArray:
     """Delay of each column against the common clock, slots; 0 where it is not significant.
 
     Args:
-        by_column: (C, period) header correlation of every column, copies added.
+        by_column: (C, period) proportional to the log-likelihood ratio of a header there, copies added.
         start: of packets, samples.
     """
     reach = int((SETTINGS.max_delay_slots + 1) * SETTINGS.search_samples)
     score = by_column.take(round(start) + np.arange(-reach, reach + 1), axis=1, mode="wrap")
     best, top = score.argmax(axis=1), score.max(axis=1)
     fine = (best + _parabola(score, best) - reach - (start - round(start))) / SETTINGS.search_samples
-    strong = top > 0.5 * np.median(top)
-    late = strong & (np.abs(fine) > SETTINGS.same_delay_slots)
-    scattered = np.count_nonzero(late) > SETTINGS.many_columns * np.count_nonzero(strong)
-    moved = (top - score[:, reach] > SETTINGS.delay_lead) | scattered
-    return np.where(moved & strong & (best > 0) & (best < 2 * reach), fine, 0.0)
+    sure = top > 0
+    late = sure & (np.abs(fine) > SETTINGS.same_delay_slots)
+    scattered = np.count_nonzero(late) > SETTINGS.many_columns * np.count_nonzero(sure)
+    moved = (top - score[:, reach] > 2 * SETTINGS.delay_lead) | scattered
+    return np.where(moved & sure & (best > 0) & (best < 2 * reach), fine, 0.0)
 
 
 def _parabola(score: FloatArray, best: NDArray[np.int64]) -> FloatArray:
