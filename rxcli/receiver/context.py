@@ -93,11 +93,14 @@ class Timer:
         try:
             yield
         finally:
-            elapsed = 1e3 * (time.perf_counter() - start)
-            self.timing_ms[name] = self.timing_ms.get(name, 0.0) + elapsed
+            self.timing_ms[name] = self.timing_ms.get(name, 0.0) + _ms_since(start)
 
     def total(self) -> dict[str, float]:
-        return {**self.timing_ms, "total": 1e3 * (time.perf_counter() - self._start)}
+        return {**self.timing_ms, "total": _ms_since(self._start)}
+
+
+def _ms_since(start: float) -> float:
+    return 1e3 * (time.perf_counter() - start)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ where T is the local picture, K the `Crosstalk`, h a slot convolved with the `Ex
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -297,7 +297,7 @@ def slot_llr(metrics: FloatArray, lit: Float32Array | None = None) -> Float32Arr
     return np.asarray(sum(gained[..., age : age + n_slots, age] for age in range(isi_memory + 1)), np.float32)
 
 
-@lru_cache(maxsize=8)
+@cache
 def _lit_by_age(isi_memory: int) -> Float32Array:
     """(patterns, memory + 1): 1 where the slot `age` slots ago is lit."""
     return np.ascontiguousarray(slot_patterns(isi_memory)[:, ::-1], np.float32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.receiver.camera.proposals import stripe_rows
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips, levelled
@@ -54,4 +55,4 @@ def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
     power = np.sqrt(summed(level[:-1] ** 2).sum(axis=0) * summed(level[1:] ** 2).sum(axis=0))
     lit = summed(weight).max(axis=0) > 0.2 * strips.rows.size / SETTINGS.likeness_bands
     lit |= summed(strips.light).max(axis=0) > 0.02 * strips.rows.size / SETTINGS.likeness_bands
-    return np.asarray(product / np.maximum(power, 1e-9)), np.asarray(lit)
+    return np.asarray(product / np.maximum(power, TINY)), np.asarray(lit)

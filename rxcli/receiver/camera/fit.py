@@ -51,9 +51,9 @@ def settle(
     least = hypothesis.stated_exposure_slots
     exposure, exposure_sd = model.exposure(start, max(clock.exposure_slots, least))
     exposure = max(exposure, least)
-    values, covariance, near = model.fit(start, exposure, 6 if may_bend else 2)
+    values, covariance, near = model.fit(start, exposure, start.size if may_bend else 2)
     if may_bend and _chi_square(values[2:], covariance[2:, 2:]) < SETTINGS.bent_chi_square:
-        values, covariance, near = model.fit(values * (np.arange(6) < 2), exposure, 2)
+        values, covariance, near = model.fit(values * (np.arange(values.size) < 2), exposure, 2)
     moved = float((np.abs(model.times(values) - model.times(start)) * model.strips.inside).max())
     if near.explained < SETTINGS.min_explained or moved > SETTINGS.max_moved_slots:
         return hypothesis, 0.0
@@ -172,16 +172,16 @@ class _Model:
         bend = (self._terms[:, :, :-1] + self._terms[:, :, 1:]) / 2
         jacobian = np.concatenate([np.full((1, *pull.shape), -1.0), -times[None, :, middle], bend])[:n_free] / values[1]
         flat = jacobian.reshape(n_free, -1)
-        prior = np.zeros((6, 6))
+        prior = np.zeros((values.size, values.size))
         prior[2:, 2:] = SETTINGS.samples_per_independent * _PRECISION
         prior = prior[:n_free, :n_free]
         inverse = np.linalg.inv((flat * information.ravel()) @ flat.T + prior + TINY * np.eye(n_free))
-        step = np.zeros(6)
+        step = np.zeros_like(values)
         step[:n_free] = inverse @ (flat @ pull.ravel() - prior @ values[:n_free])
         n_columns = self.strips.n_columns
         spread = (jacobian * pull).reshape(n_free, n_columns, -1).sum(axis=2)
         spread -= spread.mean(axis=1, keepdims=True)
         scale = SETTINGS.sd_scale**2 * n_columns / max(n_columns - 1, 1)
-        covariance = np.zeros((6, 6))
+        covariance = np.zeros((values.size, values.size))
         covariance[:n_free, :n_free] = scale * inverse @ (spread @ spread.T) @ inverse
         return step, covariance

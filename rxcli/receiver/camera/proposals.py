@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.numerics import folded, header_correlation, local_mean
+from rxcli.numerics import TINY, folded, header_correlation, local_mean
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.curvature import likeliest_bend, straightened
@@ -115,7 +115,7 @@ def _half_width(correlation: FloatArray) -> float:
     if top <= 0 or below.size == 0:
         return 0.0
     lag = int(below[0]) + 1
-    return float(lag - (top / 2 - correlation[lag]) / max(correlation[lag - 1] - correlation[lag], 1e-12))
+    return float(lag - (top / 2 - correlation[lag]) / max(correlation[lag - 1] - correlation[lag], TINY))
 
 
 def _is_same(candidate: CameraHypothesis, better: CameraHypothesis) -> bool:
@@ -198,7 +198,7 @@ def _slot_line(columns: Float32Array) -> FloatArray:
     square = np.asarray(steps * steps, np.float32)
     power = (square - local_mean(square, 10 * SLOTS_PER_SYMBOL)).sum(axis=0, dtype=np.float64)
     spectrum = np.abs(np.fft.rfft(power, _FINE * columns.shape[1])) ** 2
-    return np.asarray(spectrum / max(float(power @ power), 1e-30))
+    return np.asarray(spectrum / max(float(power @ power), TINY))
 
 
 def _peaks(values: FloatArray, n: int, distance: int) -> FloatArray:

@@ -134,9 +134,8 @@ def _timing(part: _Part, prediction: Prediction) -> FloatArray:
     residual = part.light - picture * part.whole
     variance = part.model.noise.through_picture(picture, prediction.variance[0], part.whole)
     weight = part.valid / (variance + residual * residual / np.float32(_DEGREES))
-    of_columns = (0, 2, 3)
-    numerator = (weight * residual * change).sum(axis=of_columns, dtype=np.float64)
-    return np.stack([numerator, (weight * change * change).sum(axis=of_columns, dtype=np.float64)], axis=1)
+    terms = (weight * residual * change, weight * change * change)
+    return np.stack([term.sum(axis=(0, -2, -1), dtype=np.float64) for term in terms], axis=1)
 
 
 def _pattern_metrics(part: _Part, prediction: Prediction) -> FloatArray:

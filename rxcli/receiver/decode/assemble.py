@@ -310,7 +310,7 @@ def echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolA
     beside = np.zeros(words.shape[:2], bool)
     if not like_next.any():
         return beside
-    two = (words[:, :, None] == words[:, None]).all(axis=3).sum(axis=2) == 2
+    two = (words[:, :, None] == words[:, None]).all(axis=-1).sum(axis=-1) == 2
     db = np.array([-np.inf if value is None else value for value in snr_db])
     beside[:, 1:] |= like_next & (db[1:] < db[:-1])
     beside[:, :-1] |= like_next & (db[:-1] < db[1:])

@@ -99,7 +99,7 @@ def _share_unsure(posteriors: BurstPosteriors) -> FloatArray:
     """(B, C) expected share of wrong bits, from the log-likelihood ratios of the bits."""
     known = ~np.isnan(posteriors.bit_llr)  # symbols of fewer than 7 bits are padded with NaN
     unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))
-    return np.asarray(unsure.sum(axis=(2, 3), where=known) / known.sum(axis=(2, 3)))
+    return np.asarray(unsure.sum(axis=(-2, -1), where=known) / known.sum(axis=(-2, -1)))
 
 
 def clip_quality(burst: BurstInClip) -> Quality:
@@ -112,7 +112,7 @@ def clip_quality(burst: BurstInClip) -> Quality:
         return still_quality(burst.posteriors, burst.confidence_features[None])
     features = clip_features(burst)[None]
     log_odds = clip_log_odds(burst)
-    n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(2, 3)), 1)
+    n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(-2, -1)), 1)
     ber_hat = np.maximum(_share_unsure(burst.posteriors), wrong_share(log_odds, n_bits))
     return Quality(_probability(log_odds), ber_hat, features)
 

@@ -10,7 +10,7 @@ are fixed, and the sum over all paths is the evidence for `w`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from math import comb
 
 import numpy as np
@@ -75,7 +75,7 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
             columns, w, posterior = trellis.columns[likeliest], trellis.w, trellis.word_posteriors(likeliest)
             lit[:, columns, :PREAMBLE_SLOTS] = _preamble(w)
             lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(w)).reshape(n_bursts, columns.size, -1)
-            index[:, columns] = best = posterior.argmax(axis=3)
+            index[:, columns] = best = posterior.argmax(axis=-1)
             log_prob[:, columns] = _log_of_best(posterior, best)
             bit_llr[:, columns, :, : bits_per_symbol(w)] = _bit_llr(posterior, bits_per_symbol(w))
     log_evidence = np.logaddexp.reduce(w_log_evidence, axis=1)
@@ -148,7 +148,7 @@ class _Branches:
     header: NDArray[np.int64]
 
 
-@lru_cache(maxsize=64)
+@cache
 def _branches(w: int, isi_memory: int) -> _Branches:
     words, states = codebook(w), _states(isi_memory)
     n_states = len(states)
@@ -180,7 +180,7 @@ def _states(isi_memory: int) -> NDArray[np.int64]:
     return states
 
 
-@lru_cache(maxsize=8)
+@cache
 def _boundary_patterns(isi_memory: int) -> NDArray[np.int64]:
     """(memory, states * prefixes) pattern at each of a word's first slots, by preceding state and prefix."""
     states = _states(isi_memory)
@@ -221,14 +221,14 @@ def _trellises(metrics: FloatArray, columns: NDArray[np.int64], candidates: NDAr
     """Trellis of the columns of each candidate weight, from metrics (B, columns, packet + memory, patterns)."""
     isi_memory = _isi_memory_of(metrics)
     payload = metrics[:, :, PREAMBLE_SLOTS : metrics.shape[2] - isi_memory]
-    slots = np.moveaxis(payload.reshape(*payload.shape[:2], -1, SLOTS_PER_SYMBOL, payload.shape[3]), 2, 0)
+    slots = np.moveaxis(payload.reshape(*payload.shape[:2], -1, SLOTS_PER_SYMBOL, payload.shape[-1]), 2, 0)
     patterns = _boundary_patterns(isi_memory)
     boundary = slots[..., 0, :].take(patterns[0], axis=-1)
     for slot in range(1, isi_memory):
         boundary += slots[..., slot, :].take(patterns[slot], axis=-1)
     boundary, top = _over_likeliest(boundary)
-    words = slots[..., isi_memory:, :].reshape(*slots.shape[:3], -1)
-    prior = top.sum(axis=(0, 1, 3))
+    words = slots[..., isi_memory:, :].reshape(*slots.shape[:-2], -1)
+    prior = top.sum(axis=(0, 1, -1))
     return [
         _trellis(w, columns[chosen], metrics[:, chosen], words[:, :, chosen], boundary[:, :, chosen], prior[chosen])
         for w in WEIGHTS
@@ -257,20 +257,20 @@ def _trellis(
     isi_memory = _isi_memory_of(metrics)
     branches, n_states = _branches(w, isi_memory), 1 << isi_memory
     known = metrics[:, :, np.arange(isi_memory, PREAMBLE_SLOTS), branches.preamble].sum(axis=(0, 2))
-    end = metrics[:, :, np.arange(-isi_memory, 0), branches.header].sum(axis=3)
+    end = metrics[:, :, np.arange(-isi_memory, 0), branches.header].sum(axis=-1)
     end, top_of_end = _over_likeliest(end)
     scores = words @ branches.features
     top = scores.max(axis=-1, keepdims=True)
     # Single precision suffices for probabilities and is much faster.
     remainder = np.maximum(np.exp((scores - top).astype(np.float32)), np.float32(_MIN_WORD))
     n_words = remainder.shape[-1]
-    log_scale = log_scale + known + top.sum(axis=(0, 1, 3)) + top_of_end.sum(axis=(0, 2))
+    log_scale = log_scale + known + top.sum(axis=(0, 1, -1)) + top_of_end.sum(axis=(0, 2))
     log_scale = log_scale - top[..., 0].size / len(columns) * np.log(n_words)
-    boundary = boundary.reshape(*boundary.shape[:3], n_states, n_states)
+    boundary = boundary.reshape(*boundary.shape[:-1], n_states, n_states)
     transitions = boundary @ (remainder @ branches.transition).reshape(boundary.shape)
     start = np.broadcast_to(branches.start, end.shape)
     # One chain for both directions: symbols are sequential, so everything else is batched.
-    directions = np.concatenate([transitions, transitions[::-1].swapaxes(3, 4)], axis=1)
+    directions = np.concatenate([transitions, transitions[::-1].swapaxes(-2, -1)], axis=1)
     states, log_total = _chain(directions, np.concatenate([start, end]))
     before, after = states[:, : len(end)], states[::-1, len(end) :]
     last = np.log(np.maximum((before[-1] * end).sum(axis=2), _MIN_LIKELIHOOD)) + log_total[: len(end)]
@@ -371,9 +371,9 @@ def _weight_scores(symbols: Float32Array) -> FloatArray:
     """(C, 9) log-likelihood of every weight, from slot log-likelihood ratios (B, C, symbols, 10)."""
     symbols = np.clip(symbols, -SETTINGS.max_llr, SETTINGS.max_llr)
     payload = symbols[:, :, 2:]
-    coefficients = np.zeros((*payload.shape[:3], SLOTS_PER_SYMBOL + 1))
+    coefficients = np.zeros((*payload.shape[:-1], SLOTS_PER_SYMBOL + 1))
     coefficients[..., 0] = 1.0
-    for slot in np.moveaxis(np.exp(payload), 3, 0):
+    for slot in np.moveaxis(np.exp(payload), -1, 0):
         coefficients[..., 1:] += coefficients[..., :-1] * slot[..., None]
     words = np.array([comb(SLOTS_PER_SYMBOL, w) for w in WEIGHTS])
     score = np.log(coefficients[..., 1:SLOTS_PER_SYMBOL] / words).sum(axis=(0, 2))
@@ -397,6 +397,6 @@ def initial_slot_probability(metrics: FloatArray) -> Float32Array:
         lit[:, columns, :2] = _preamble(int(w)).reshape(2, -1)
         words = codebook(int(w)).astype(np.float32)
         score = symbols[:, columns, 2:] @ words.T
-        likely = np.exp(score - score.max(axis=3, keepdims=True))
-        lit[:, columns, 2:] = likely @ words / likely.sum(axis=3, keepdims=True)
+        likely = np.exp(score - score.max(axis=-1, keepdims=True))
+        lit[:, columns, 2:] = likely @ words / likely.sum(axis=-1, keepdims=True)
     return lit.reshape(*lit.shape[:2], -1)

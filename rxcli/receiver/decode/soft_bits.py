@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.decode.assemble import echoes
 from rxcli.receiver.decode.confidence import BurstInClip, clip_log_odds, confidence_log_odds, wrong_share
@@ -39,11 +40,11 @@ def llr_limits(posteriors: BurstPosteriors, n_observed: IntArray, log_odds: Floa
         log_odds: (B, C) calibrated log-odds that every observed symbol is right.
     """
     known = observed_symbols(n_observed)[..., None] & ~np.isnan(posteriors.bit_llr)
-    n_bits = np.maximum(known.sum(axis=(2, 3)), 1)
+    n_bits = np.maximum(known.sum(axis=(-2, -1)), 1)
     wrong = wrong_share(log_odds, n_bits)
-    own = (known / (1 + np.exp(np.abs(np.nan_to_num(posteriors.bit_llr))))).sum(axis=(2, 3)) / n_bits
+    own = (known / (1 + np.exp(np.abs(np.nan_to_num(posteriors.bit_llr))))).sum(axis=(-2, -1)) / n_bits
     hidden = np.maximum(wrong - own, SETTINGS.hidden_error_share * wrong)
-    return np.asarray(np.clip(-np.log(np.maximum(hidden, 1e-9)), 0.0, SETTINGS.max_bit_llr))
+    return np.asarray(np.clip(-np.log(np.maximum(hidden, TINY)), 0.0, SETTINGS.max_bit_llr))
 
 
 def limit_llr(posteriors: BurstPosteriors, limits: FloatArray, erased: BoolArray) -> Float32Array:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
@@ -56,7 +57,7 @@ def is_common_light(value: Float32Array, weight: Float32Array, shared: float, re
     chosen = np.linspace(0, column_a.size - 1, min(column_a.size, _MAX_PAIRS)).astype(np.int64)
     observed = weight > 0
     level = (value - _mean(value, observed)) * observed
-    level = level / np.maximum(np.sqrt(np.square(level).sum(axis=1, keepdims=True)), 1e-9)
+    level = level / np.maximum(np.sqrt(np.square(level).sum(axis=1, keepdims=True)), TINY)
     spectrum = np.fft.rfft(level, n + reach, axis=1)
     moved = np.fft.irfft(spectrum[column_a[chosen]] * np.conj(spectrum[column_b[chosen]]), n + reach, axis=1)
     similarity = np.concatenate([moved[:, : reach + 1], moved[:, moved.shape[1] - reach :]], axis=1).max(axis=1)
