@@ -5,7 +5,7 @@ Outlines of one family share all columns but the outermost. A column of the scre
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,8 +21,10 @@ from rxcli.receiver.still import initial_pass
 _BESIDE = 2
 
 
-def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Proposer) -> Iterator[Outline]:
-    """Yield the outlines, with lower log-odds where they leave out columns with packets.
+def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Proposer) -> list[Outline]:
+    """The outlines, with lower log-odds where they leave out columns with packets.
+
+    All outlines that begin further to one side leave out the columns that the nearest of them leaves out.
 
     Args:
         best: the hypothesis that was chosen.
@@ -31,16 +33,21 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
     """
     own, n_columns = best.hypothesis.outline, best.hypothesis.screen.columns
     acquisition = replace(best.acquisition, clock=best.reception.clock)
-    for rival in outlines:
-        shift = _columns_between(own, rival, n_columns)
-        is_rival = rival.family == own.family and rival.log_odds > own.log_odds - SETTINGS.rival_log_odds
-        if not is_rival or not 0 < abs(shift) <= SETTINGS.max_shift:
-            yield rival
+    out = list(outlines)
+    shifts = [_columns_between(own, rival, n_columns) if rival.family == own.family else 0 for rival in outlines]
+    for side in (-1, 1):
+        rivals = [index for index, shift in enumerate(shifts) if shift * side > 0]
+        if all(outlines[index].log_odds < own.log_odds - SETTINGS.rival_log_odds for index in rivals):
             continue
-        moved = replace(best.hypothesis, outline=rival, rows=0, camera=best.context.camera)
+        nearest = min(rivals, key=lambda index: abs(shifts[index]))
+        moved = replace(best.hypothesis, outline=outlines[nearest], rows=0, camera=best.context.camera)
         sampler = sample_columns(proposer.context(moved), n_columns)
+        shift = shifts[nearest]
         gain = _outer_evidence(replace(acquisition, sampler=sampler), -shift) - _outer_evidence(acquisition, shift)
-        yield replace(rival, log_odds=rival.log_odds + SETTINGS.outer_weight * min(gain, 0.0))
+        for index in rivals:
+            log_odds = outlines[index].log_odds + SETTINGS.outer_weight * min(gain, 0.0)
+            out[index] = replace(outlines[index], log_odds=log_odds)
+    return out
 
 
 def _columns_between(own: Outline, rival: Outline, n_columns: int) -> int:

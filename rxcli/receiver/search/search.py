@@ -64,7 +64,7 @@ def search(
     if best is None:
         return replace(why_no_packets(proposer, walk.nearest, walk.failure), tried=walk.record(None))
     if best.evidence >= SETTINGS.few_packets:
-        outlines = list(less_likely_outlines(best, outlines, proposer))
+        outlines = less_likely_outlines(best, outlines, proposer)
     chosen = replace(
         numbered(best.hypothesis.outline, outlines, walk.score_of), corners=best.hypothesis.corners, other_rows=()
     )
