@@ -226,7 +226,7 @@ class _Walk:
         with self._proposer.timer("detect"):
             reception = initial_pass(acquisition)
             own = evidence.log_evidence(reception)
-            score = evidence.score(reception, acquisition, own, hypothesis.log_prior)
+            score = evidence.score(reception, own, hypothesis.log_prior)
         return Scored(hypothesis, self._proposer.context(hypothesis), acquisition, reception, own, score)
 
 

@@ -13,9 +13,8 @@ class SearchSettings:
     temper: float = 0.08
     #: Weight of headers without symbols relative to packets.
     header_weight: float = 0.1
-    #: Evidence that a complete packet adds; weight of the copies' similarity, half already in the packets.
+    #: Evidence that a complete packet adds.
     complete_packet: float = 60.0
-    copies_weight: float = 0.5
     #: Above this evidence no further cameras are proposed: wrong clocks reach 391.
     plain: float = 400.0
     #: Below this evidence there are no packets: wrong clocks mostly have less than 10, right ones 80.
