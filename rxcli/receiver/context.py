@@ -37,8 +37,6 @@ class Outline:
     family: int = 0
     #: Whether light reaches to both ends of the picture.
     fills: bool = False
-    #: Alternative corners with other top and bottom rows, likeliest first.
-    other_rows: tuple[FloatArray, ...] = ()
     #: Strips of the picture on which it was found; None where it was given.
     strips: Strips | None = field(default=None, repr=False, compare=False)
     #: Estimated lens that bends the columns; used where the camera has no known lens.

@@ -72,7 +72,6 @@ def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
             log_odds=candidate.log_odds,
             family=candidate.layout.n_columns,
             fills=candidate.fills,
-            other_rows=candidate.corners[1:],
             strips=candidate.strips,
             lens=candidate.grid.estimated_lens,
             n_columns=None if is_usual else candidate.layout.n_columns,
@@ -109,8 +108,7 @@ def layouts_of(options: ReceiverOptions) -> list[ColumnLayout]:
 
 def _as_viewed(outline: Outline, orientation: int) -> Outline:
     """An outline with its corners in the viewer's order."""
-    corners, *other_rows = (geometry.viewer_order(rows, orientation) for rows in (outline.corners, *outline.other_rows))
-    return replace(outline, corners=corners, other_rows=tuple(other_rows))
+    return replace(outline, corners=geometry.viewer_order(outline.corners, orientation))
 
 
 def unreadable_orientation(frame: Frame) -> Failure | None:

@@ -44,9 +44,8 @@ class WiringSettings:
 class StillSettings:
     """Thresholds, each with its unit and its reason."""
 
-    #: Samples per slot of the first passes, and of later passes over doubtful columns.
+    #: Samples per slot of the first passes.
     coarse_samples: int = 2
-    fine_samples: int = 4
     #: Confidence below which a column with a symbol below `beyond_doubt_log_prob` gets further passes.
     doubtful: float = 0.985
     #: Limit of strip slots for the network, which takes most of the time; the least certain columns are left out.

@@ -64,7 +64,7 @@ def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception | 
     candidates = doubtful_columns(reception) if "certain_columns" in skip else np.arange(reception.snr.shape[0])
     lit = candidates[~dark_columns(reception.snr)[candidates]] if "dark_columns" in skip else candidates
     skipped = {"certain_columns": reception.snr.shape[0] - candidates.size, "dark_columns": candidates.size - lit.size}
-    for run_pass in (_coarse, _fine, _without_row_noise, _without_row_noise):
+    for run_pass in (_of_all_strips, _without_row_noise, _without_row_noise):
         columns = np.intersect1d(lit, doubtful_columns(reception)) if "certain_columns" in skip else lit
         if columns.size:
             reception = run_pass(acquisition, reception, columns)
@@ -104,28 +104,15 @@ def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
     return np.flatnonzero(has_doubtful_packet(reception, STILL.doubtful))
 
 
-def _coarse(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
-    """Use all strips and all scales of the picture, and correct the clock."""
-    after, timing = _refined(acquisition, reception, columns, STILL.coarse_samples)
-    return replace(after, clock=sync.corrected(after.clock, timing))
-
-
-def _fine(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
-    """Use more samples per slot."""
-    return _refined(acquisition, reception, columns, STILL.fine_samples)[0]
-
-
-def _refined(
-    acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64], samples_per_slot: int
-) -> tuple[Reception, FloatArray]:
-    """Receive some columns with more samples; also return the (C, 2) timing, 0 for other columns."""
-    samples, model = _view(acquisition, reception, columns, samples_per_slot)
+def _of_all_strips(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
+    """Receive some columns with all strips and all scales of the picture, and correct the clock."""
+    samples, model = _view(acquisition, reception, columns, STILL.coarse_samples)
     lit = reception.clock.on_grid(reception.posteriors.lit)
-    is_coarse = samples_per_slot == STILL.coarse_samples
-    likelihoods = channel.slot_likelihoods(samples, reception.clock, model, lit, columns, timing=is_coarse)
+    likelihoods = channel.slot_likelihoods(samples, reception.clock, model, lit, columns)
     timing = np.zeros((lit.shape[0], 2))
     timing[columns] = likelihoods.timing
-    return _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr), timing
+    after = _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr)
+    return replace(after, clock=sync.corrected(after.clock, timing))
 
 
 def _with_metrics(

@@ -9,7 +9,7 @@ from rxcli.profiles import ScreenProfile
 from rxcli.receiver.acquisition import Acquisition, ColumnSampler
 from rxcli.receiver.context import Camera, FrameContext, Outline
 from rxcli.receiver.reception import Reception
-from rxcli.types import Clock, FloatArray, SearchStep
+from rxcli.types import Clock, SearchStep
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,8 +17,6 @@ class Hypothesis:
     """A hypothesis about a picture. Its clock is found, and its columns are read, only before its initial pass."""
 
     outline: Outline
-    #: Index among the outline's candidate rows, 0 the likeliest.
-    rows: int
     camera: Camera
     screen: ScreenProfile
     #: The screen and others that differ only in the number of copies per burst, largest number first.
@@ -30,17 +28,11 @@ class Hypothesis:
     sampler: ColumnSampler | None = field(default=None, repr=False, compare=False)
 
     @property
-    def corners(self) -> FloatArray:
-        """(4, 2) stored pixels, the viewer's top left first."""
-        return (self.outline.corners, *self.outline.other_rows)[self.rows]
-
-    @property
     def identity(self) -> tuple[object, ...]:
         """Equal for hypotheses that an initial pass cannot distinguish; also the order of ties."""
         estimate = self.camera.hypothesis
         return (
             self.outline.family,
-            self.rows,
             estimate.number if estimate else 0,
             self.screen.packet_slots,
             self.screen.columns,
@@ -82,7 +74,7 @@ class Tried:
         """The same in words, for a result."""
         own = self.hypothesis
         rows_per_slot = 1 / (own.camera.line_delay_s * own.screen.slot_rate_hz)
-        parts = [own.screen.name, f"rows {own.rows}", f"{rows_per_slot:.4g} rows per slot"]
+        parts = [own.screen.name, f"{rows_per_slot:.4g} rows per slot"]
         parts += ["reversed"] if own.camera.reversed else []
         parts += [f"bursts {' '.join(map(str, own.bursts))}"] if own.bursts else []
         return SearchStep(", ".join(parts), own.log_prior, self.evidence, self.score, self.fate)

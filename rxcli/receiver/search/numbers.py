@@ -40,7 +40,7 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
         if all(outlines[index].log_odds < own.log_odds - SETTINGS.rival_log_odds for index in rivals):
             continue
         nearest = min(rivals, key=lambda index: abs(shifts[index]))
-        moved = replace(best.hypothesis, outline=outlines[nearest], rows=0, camera=best.context.camera)
+        moved = replace(best.hypothesis, outline=outlines[nearest], camera=best.context.camera)
         sampler = sample_columns(proposer.context(moved), n_columns)
         shift = shifts[nearest]
         gain = _outer_evidence(replace(acquisition, sampler=sampler), -shift) - _outer_evidence(acquisition, shift)

@@ -79,26 +79,23 @@ class Proposer:
         return failure
 
     def _of_camera(self, camera: Camera, log_prior: float) -> list[Hypothesis]:
-        """Hypotheses of one camera: a screen for every outline and clock; the likeliest outline on other rows too."""
-        screens, families, out = self._screens(), self.families(), []
+        """Hypotheses of one camera: a screen for every outline and clock."""
+        screens, out = self._screens(), []
         if camera.hypothesis is not None:
             screens = tuple(screen for screen in screens if screen.packet_slots == camera.hypothesis.packet_slots)
-        for outline in families:
+        for outline in self.families():
             for same_clock in _by_clock(outline, camera, screens).values():
                 screen = _nearest(same_clock, _USUAL_COLUMNS)
-                likely = self._hypothesis(outline, camera, screen, log_prior + SETTINGS.temper * outline.log_odds)
-                out += [likely, *(_of_other_rows(likely) if outline is families[0] else ())]
+                out.append(self._hypothesis(outline, camera, screen, log_prior + SETTINGS.temper * outline.log_odds))
         return out
 
     def _screens(self) -> tuple[ScreenProfile, ...]:
         return self.known.screens if self.known else self.options.screens
 
-    def _hypothesis(
-        self, outline: Outline, camera: Camera, screen: ScreenProfile, log_prior: float, rows: int = 0
-    ) -> Hypothesis:
+    def _hypothesis(self, outline: Outline, camera: Camera, screen: ScreenProfile, log_prior: float) -> Hypothesis:
         variants = variants_of(screen, self.options.screens)
         camera = relabelled_camera(camera, screen, self.frame)
-        return Hypothesis(outline, rows, camera, variants[0], variants, log_prior)
+        return Hypothesis(outline, camera, variants[0], variants, log_prior)
 
     def context(self, hypothesis: Hypothesis) -> FrameContext:
         """The frame under a hypothesis, with the screens that its camera allows."""
@@ -112,7 +109,7 @@ class Proposer:
                 for screen in screens
                 if (screen.slot_rate_hz, screen.packet_slots) == (own.slot_rate_hz, own.packet_slots)
             )
-        return FrameContext(self.frame, hypothesis.corners, camera, screens, self.timer)
+        return FrameContext(self.frame, hypothesis.outline.corners, camera, screens, self.timer)
 
     def with_clock(self, hypothesis: Hypothesis) -> Hypothesis | None:
         """The hypothesis with its columns and its clock, or None if no header is found."""
@@ -137,7 +134,6 @@ class Proposer:
         hypothesis = replace(scored.hypothesis, camera=scored.context.camera, clock=None, sampler=None, bursts=None)
         outline, camera, log_prior = hypothesis.outline, hypothesis.camera, hypothesis.log_prior
         clock, n_columns = _clock_of(hypothesis.screen, camera), hypothesis.screen.columns
-        yield from _of_other_rows(hypothesis)
         for candidate in self.families():
             same_clock = _by_clock(candidate, camera, self.options.screens).get(clock)
             if same_clock and candidate.family != outline.family:
@@ -147,11 +143,11 @@ class Proposer:
         by_columns = {screen.columns: screen for screen in reversed(by_clock.pop(clock, []))}
         for columns, screen in by_columns.items():
             if columns != n_columns and scored.evidence < SETTINGS.plain:
-                yield self._hypothesis(outline, camera, screen, log_prior, hypothesis.rows)
+                yield self._hypothesis(outline, camera, screen, log_prior)
         if _is_clear(scored.reception):
             return
         for same_clock in by_clock.values() if camera.hypothesis is not None else ():
-            sibling = self._hypothesis(outline, camera, _nearest(same_clock, n_columns), log_prior, hypothesis.rows)
+            sibling = self._hypothesis(outline, camera, _nearest(same_clock, n_columns), log_prior)
             if too_small(self.context(sibling), sibling.screen) is None:
                 yield sibling
         yield from self._of_other_bursts(scored)
@@ -173,14 +169,6 @@ class Proposer:
                     sampler=scored.acquisition.sampler,
                     bursts=tuple(clock.burst.tolist()),
                 )
-
-
-def _of_other_rows(hypothesis: Hypothesis) -> Iterator[Hypothesis]:
-    """The hypothesis on the other rows that its outline may have."""
-    likely = hypothesis.log_prior + SETTINGS.other_rows * (hypothesis.rows > 0)
-    for rows in range(1 + len(hypothesis.outline.other_rows)):
-        if rows != hypothesis.rows:
-            yield replace(hypothesis, rows=rows, log_prior=likely - SETTINGS.other_rows * (rows > 0))
 
 
 def _is_clear(reception: Reception) -> bool:

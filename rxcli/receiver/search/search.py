@@ -65,9 +65,7 @@ def search(
         return replace(why_no_packets(proposer, walk.nearest, walk.failure), tried=walk.record(None))
     if best.evidence >= SETTINGS.few_packets:
         outlines = less_likely_outlines(best, outlines, proposer)
-    chosen = replace(
-        numbered(best.hypothesis.outline, outlines, walk.score_of), corners=best.hypothesis.corners, other_rows=()
-    )
+    chosen = numbered(best.hypothesis.outline, outlines, walk.score_of)
     refused = light_without_data(best.context, best.acquisition)
     if refused is not None:
         return replace(refused, outline=chosen, context=best.context, tried=walk.record(best, "no data"))

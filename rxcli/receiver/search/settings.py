@@ -32,9 +32,8 @@ class SearchSettings:
     clear_lead: float = 3.0
     lead_weight: float = 2.0
     min_lead: float = 1.6
-    #: Log prior lost by each further camera, and by rows that are not the outline's likeliest.
+    #: Log prior lost by each further camera.
     next_camera: float = 0.5
-    other_rows: float = 2.5
     #: Bursts are certain if this share of the columns has packets of this confidence, or if the similarity of copies
     #: leads by this log-likelihood.
     clear_columns: float = 0.9
