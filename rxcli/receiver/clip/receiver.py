@@ -86,8 +86,6 @@ class Tracking:
 
     known: Known
     scene: TrackedScreen
-    #: Frames in a row that were received like photographs all the same.
-    n_unknown: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,7 +93,6 @@ class Lost:
     """No picture is known: the screen was lost, or frames of this kind cannot be tracked."""
 
     known: Known
-    n_unknown: int = 0
 
 
 State = Acquiring | Tracking | Lost
@@ -265,11 +262,11 @@ def _receive_anew(
     Returns:
         The state after it, its view, and what the auto-encoder reports.
     """
-    known, ledger, before = state.known, state.known.ledger, state.scene if isinstance(state, Tracking) else None
+    known, ledger = state.known, state.known.ledger
     camera = known.camera.for_frame(frame)
     located = located or camera.locate(frame, timer)
     if isinstance(located, Failure):
-        return Lost(replace(known, camera=camera), state.n_unknown), located, None
+        return Lost(replace(known, camera=camera)), located, None
     ledger.certainty = located.outline.certainty
     corners = located.outline.corners
     camera = camera.found_with(located, frame)
@@ -277,7 +274,7 @@ def _receive_anew(
     context = replace(camera.context, frame=frame, corners=corners, timer=timer)
     predicted = None if ledger.start is None else acquisition_at(ledger.start, context)
     camera, settled = camera.settled(replace(located, context=context), predicted)
-    lost = Lost(replace(known, camera=camera, corners=corners), state.n_unknown)
+    lost = Lost(replace(known, camera=camera, corners=corners))
     if isinstance(settled, Failure):
         return lost, settled, None
     reception, denoised, report = _decoded(settled, known, timer)
@@ -300,31 +297,14 @@ def _receive_anew(
         reception.snr,
         denoised,
     )
-    n_unknown = state.n_unknown + 1
     if not _can_track(settled, camera.options):
-        return replace(lost, n_unknown=n_unknown), view, report
+        return lost, view, report
     with timer("sampling"):
         named = camera.options.corners is not None
         scene = TrackedScreen(settled.context, settled.acquisition, reception.model.black_level, named)
         view.light, view.pose = scene.strips(frame), scene.pose
     scene.update(view, lambda: reception.clock.on_grid(reception.posteriors.lit))
-    if before is not None and n_unknown <= SETTINGS.max_unknown_frames and _goes_on(before, scene, view, ledger.time):
-        # A hand before the screen, or a frame too quick to be followed, is no reason to learn the picture anew.
-        before.seek(scene.corners)
-        scene, view.light, view.pose = before, None, None
-    return Tracking(lost.known, scene, n_unknown), view, report
-
-
-def _goes_on(before: TrackedScreen, scene: TrackedScreen, view: View, time: tracking.LinkTime | None) -> bool:
-    """Whether a frame received like a photograph shows the scene before: same screen, place and time."""
-    last, bursts = before.last, view.bursts
-    return (
-        time is not None
-        and last is not None
-        and view.acquisition.screen is last.acquisition.screen
-        and before.near(scene.corners)
-        and time.agrees(bursts.frame, view.context.frame.time_s, bursts.clock)
-    )
+    return Tracking(lost.known, scene), view, report
 
 
 def _decoded(settled: Settled, known: Known, timer: Timer) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:

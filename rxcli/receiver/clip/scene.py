@@ -85,10 +85,6 @@ class TrackedScreen:
 
     # -- where the screen is -----------------------------------------------------------------------------------
 
-    def near(self, corners: FloatArray) -> bool:
-        """Whether a screen found at the corners is where this one is."""
-        return bool(np.abs(corners - self.corners).max() < SETTINGS.near_outline * np.ptp(self.corners[:, 0]))
-
     def _follow(self, frame: Frame) -> bool:
         """Find where the screen is in a frame, by the picture on it; returns whether that is certain."""
         self._n_unlooked = 0
@@ -168,10 +164,6 @@ class TrackedScreen:
     @property
     def _width(self) -> float:
         return float(np.ptp(self.corners[:, 0]))
-
-    def seek(self, corners: FloatArray) -> None:
-        """Expect the screen near the corners (4, 2) next."""
-        self._texture.seek(corners)
 
     def _move(self, frame: Frame, found: Registration) -> None:
         n_columns, n_strips, _ = self._first_pose.map.inside.shape

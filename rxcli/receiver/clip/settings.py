@@ -34,8 +34,6 @@ class ClipSettings:
     outline_reach: float = 0.02
     #: How much of its shape an outline may lose or win between two looks, in screen widths.
     bent_outline: float = 0.012
-    #: A screen found anew whose corners are closer than this to where they were, in screen widths, is where it was.
-    near_outline: float = 0.06
     #: Frames from which the picture is learned one by one, and how often from then on.
     first_updates: int = 12
     update_every: int = 6
@@ -81,8 +79,6 @@ class ClipSettings:
     same_step: int = 15
     same_contrast: float = 3.0
     same_share: float = 0.25
-    #: Frames in a row that may be received like photographs before the picture is learned anew.
-    max_unknown_frames: int = 3
     #: How much longer than from one frame to the next a readout may seem to take: time stamps are rounded.
     readout_slack: float = 1.1
     #: Frames that find their clock together where each shows little.

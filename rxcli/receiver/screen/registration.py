@@ -153,10 +153,6 @@ class ScreenTexture:
         plane = covariance @ (information @ at.ravel() + known * measured.ravel())
         return Registration(self._distorted(plane.reshape(4, 2)), covariance, found.correlation)
 
-    def seek(self, corners: FloatArray) -> None:
-        """Expect the next frame at corners (4, 2) that were found in another way."""
-        self._before = self._plane = self._undistorted(corners)
-
     def learn(self, frame: Frame, found: Registration) -> None:
         """Update the texture with a frame in which the screen was found."""
         self._before, self._plane = self._plane, self._undistorted(found.corners)

@@ -110,16 +110,6 @@ class LinkTime:
                 return float(stretch)
         return None
 
-    def agrees(self, frame: int, time_s: float, clock: Clock) -> bool:
-        """Whether a frame's clock agrees with the link time, up to whole packets."""
-        predicted = self.predict(frame, time_s)
-        if predicted is None or self._period is None:
-            return True
-        error = clock.first_slot - clock.row0 / clock.rows_per_slot - predicted
-        return (
-            abs((error + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2) <= SETTINGS.max_jump_slots
-        )
-
     def clock_at(self, frame: int, time_s: float, like: Clock, n_slots: int, top_row: float) -> Clock | None:
         """Predict the clock of a frame from earlier frames.
 
