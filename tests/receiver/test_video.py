@@ -21,9 +21,10 @@ from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.receiver.channel.known_picture import ColumnLight, KnownPicture, Observation
 from rxcli.receiver.clip.bursts import Burst, with_common_memory
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.decode.detect import detect
+from rxcli.receiver.decode.detect import detect, plausible_weights
 from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.pipeline import receive, receive_frame
+from rxcli.receiver.settings import SETTINGS as RECEIVER
 from rxcli.receiver.sync.tracking import BurstPhase, LinkTime
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Clock, Float32Array, Frame, FrameResult
@@ -492,13 +493,13 @@ def test_columns_not_yet_tried_are_unknown() -> None:
     rng = np.random.default_rng(2)
     columns, packet, isi_memory = 4, 70, 1
     metrics = rng.normal(0, 2, (1, columns, packet + isi_memory, 4))
-    burst = Burst(7, metrics[0], np.ones((columns, packet), np.int64), (0,), tracked=False)
     tried = np.array([0, 2])
-    found = detect(metrics[:, tried])
-    burst.detected(tried, found)
-    assert burst.posteriors is not None
+    light = np.isin(np.arange(columns), tried)
+    burst = Burst(7, metrics[0], np.ones((columns, packet), np.int64), (0,), tracked=False, tried=light)
+    metrics = metrics[:, tried]
+    found = detect(metrics, plausible_weights(metrics, RECEIVER.weight_margin))
     assert (burst.posteriors.index[:, tried] == found.index).all()
-    assert (burst.lit[[1, 3]] == 0.5).all()
+    assert (burst.posteriors.lit[0, [1, 3]] == 0.5).all()
     assert not burst.posteriors.bit_llr[0, [1, 3]][..., :6].any()
     assert not burst.certain[[1, 3]].any()
 

@@ -1,25 +1,26 @@
-"""The bursts of a clip: metrics of several frames are added, and detected when their result is needed."""
+"""The bursts of a clip: the evidence of several frames is added, and detected when its result is needed."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS, WEIGHTS
 from rxcli.receiver import channel
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.clip.views import View, Waiting
+from rxcli.receiver.clip.views import View
 from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.light import slot_llr
 from rxcli.receiver.settings import SETTINGS as receiver_settings
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, IntArray
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Burst:
-    """A burst, added up over the frames that show it."""
+    """What some frames show of a burst; the sum of two is what all their frames show."""
 
     #: Number in the clip.
     number: int
@@ -30,43 +31,43 @@ class Burst:
     frames: tuple[int, ...]
     #: Whether the picture was known from other frames in any of them.
     tracked: bool
-    #: Of this burst alone, once detected.
-    posteriors: BurstPosteriors | None = None
-    #: Whether frames were added since the last detection.
-    is_stale: bool = True
+    #: (C,) columns with enough light in any of them; the others are not detected.
+    tried: BoolArray
 
-    def add(self, burst: Burst) -> None:
-        """Add what a further frame shows of it."""
-        self.metrics, added = with_common_memory([self.metrics, burst.metrics])
-        self.metrics += added
-        self.n_observed = self.n_observed + burst.n_observed
-        self.frames += burst.frames
-        self.tracked |= burst.tracked
-        self.is_stale = True
+    def __add__(self, other: Burst) -> Burst:
+        metrics, more = with_common_memory([self.metrics, other.metrics])
+        return Burst(
+            self.number,
+            metrics + more,
+            self.n_observed + other.n_observed,
+            self.frames + other.frames,
+            self.tracked or other.tracked,
+            self.tried | other.tried,
+        )
+
+    @cached_property
+    def posteriors(self) -> BurstPosteriors:
+        """Of this burst alone; columns that are not tried are unknown."""
+        columns = np.flatnonzero(self.tried)
+        unknown = _unobserved(self.metrics, self.tried.size)
+        if not columns.size:
+            return unknown
+        metrics = self.metrics[None, columns]
+        found = detect.detect(metrics, detect.plausible_weights(metrics, receiver_settings.weight_margin))
+        return found if columns.size == self.tried.size else unknown.with_columns(columns, found)
 
     @property
     def certain(self) -> BoolArray:
-        """(C,) columns that need no further pass."""
-        if self.posteriors is None:
-            return np.zeros(len(self.n_observed), bool)
+        """(C,) columns that further frames add nothing to."""
         return np.asarray(self.posteriors.log_prob[0].min(axis=1) >= SETTINGS.certain_log_prob)
 
     @property
-    def lit(self) -> Float32Array:
-        """(C, packet) probability that each slot is lit."""
-        half = np.full(self.n_observed.shape, 0.5, np.float32)
-        return half if self.posteriors is None else np.asarray(self.posteriors.lit[0])
-
-    def detected(self, columns: IntArray, posteriors: BurstPosteriors) -> None:
-        """Set the posteriors of some columns."""
-        n = len(self.n_observed)
-        if columns.size < n:
-            posteriors = (self.posteriors or _unobserved(self.metrics, n)).with_columns(columns, posteriors)
-        self.posteriors = posteriors
+    def probability(self) -> Float32Array:
+        """(C,) of the packets as detected, by the light model alone."""
+        return np.asarray(np.exp(self.posteriors.log_prob[0].sum(axis=1)), np.float32)
 
     def ended(self, first_number: int, n_strips: int) -> confidence.BurstInClip:
         """What is reported of it; `first_number` is that of the first burst of the last frame that shows it."""
-        assert self.posteriors is not None
         features = against = None
         if self.tracked:
             llr = slot_llr(self.metrics[None])[0, :, PREAMBLE_SLOTS:]
@@ -82,108 +83,42 @@ class Burst:
         )
 
 
-class Bursts:
-    """The bursts that are still going on.
+def bursts_of(view: View, numbers: IntArray, tried: BoolArray) -> list[Burst]:
+    """What a frame shows of its bursts (B,); `tried` (C,) are the columns to detect."""
+    own = view.bursts
+    metrics = channel.by_burst(own.metrics, own.clock)
+    return [
+        Burst(number, metrics[index], own.shown[own.clock.burst == index].sum(axis=0), (own.frame,), own.tracked, tried)
+        for index, number in enumerate(numbers.tolist())
+    ]
 
-    Args:
-        skip: what may be skipped, see `rxcli.options`.
-    """
 
-    def __init__(self, skip: frozenset[str]) -> None:
-        self._skip = skip
-        #: Whether dark columns are tried in every frame.
-        self.dark_too = False
-        self.begin()
+def has_light(view: View) -> BoolArray:
+    """(C,) columns of a frame with enough light to try; now and then, and of a photograph, all of them."""
+    if view.flat is None or (view.bursts.frame + 1) % SETTINGS.try_dark_every == 0:
+        return np.ones(len(view.snr), bool)
+    return np.asarray(np.median(view.snr, axis=1) >= SETTINGS.dark_snr)
 
-    def begin(self) -> None:
-        """Forget all bursts."""
-        self._open: dict[int, Burst] = {}
-        self._closed: list[Burst] = []
 
-    def settled(self, number: int, lit: BoolArray) -> bool:
-        """Whether all lit columns (C,) of a burst, open or closed, are certain."""
-        return any(
-            burst.number == number and bool(burst.certain[lit].all()) for burst in (*self._open.values(), *self._closed)
-        )
+def lit_slots(view: View, numbers: IntArray, bursts: Sequence[Burst]) -> Float32Array:
+    """(C, N) probability that each slot of a frame is lit, by what is known of its bursts (B,)."""
+    clock = view.bursts.clock
+    lit = np.full((numbers.size, len(view.snr), clock.packet_slots), 0.5, np.float32)
+    for burst in bursts:
+        lit[numbers == burst.number] = burst.posteriors.lit[0]
+    return clock.on_grid(lit)
 
-    def add(self, view: View, numbers: IntArray) -> None:
-        """Add a frame to its bursts (B,), which are detected when their result is needed."""
-        own = view.bursts
-        metrics = channel.by_burst(own.metrics, own.clock)
-        for index, number in enumerate(numbers.tolist()):
-            n_observed = own.shown[own.clock.burst == index].sum(axis=0)
-            burst = Burst(number, metrics[index].copy(), n_observed, (own.frame,), own.tracked)
-            if number in self._open:
-                self._open[number].add(burst)
-            elif not self._closed or number > self._closed[-1].number:
-                self._open[number] = burst
 
-    def close(self, numbers: IntArray) -> list[Burst]:
-        """Remove bursts in time order; later frames add nothing to them or to earlier ones."""
-        closed = [self._open.pop(number) for number in np.sort(numbers).tolist() if number in self._open]
-        self._closed = [*self._closed, *closed][-SETTINGS.remembered_bursts :]
-        return [burst for burst in closed if burst.posteriors is not None]
-
-    def of(self, waiting: Waiting) -> list[Burst]:
-        """The bursts of a frame that are open."""
-        assert waiting.numbers is not None
-        return [self._open[number] for number in waiting.numbers.tolist() if number in self._open]
-
-    def detect_stale(self, waiting: Waiting) -> None:
-        """Detect the bursts of a frame that were added to since they were looked at."""
-        self.detect(waiting, [burst for burst in self.of(waiting) if burst.is_stale], self.dark_too)
-
-    def detect(self, waiting: Waiting, bursts: Sequence[Burst], dark_too: bool) -> None:
-        """Detect open bursts of a frame together, for they share the columns' weights; dark columns if `dark_too`."""
-        assert waiting.view is not None
-        tried = np.flatnonzero(~self._dark(waiting.view) | dark_too)
-        waiting.skip("dark_columns", len(bursts) * (len(waiting.view.snr) - tried.size))
-        if bursts and tried.size:
-            metrics = np.stack(with_common_memory([burst.metrics[tried] for burst in bursts]))
-            found = detect.detect(metrics, detect.plausible_weights(metrics, receiver_settings.weight_margin))
-            for index, burst in enumerate(bursts):
-                burst.detected(tried, found.of_burst(index))
-        for burst in bursts:
-            burst.is_stale = False
-
-    def _dark(self, view: View) -> BoolArray:
-        """(C,) columns of a tracked frame with too little light to try; now and then they are tried all the same."""
-        tried = (view.bursts.frame + 1) % SETTINGS.try_dark_every == 0
-        if view.flat is None or "dark_columns" not in self._skip or tried:
-            return np.zeros(view.snr.shape[0], bool)
-        return np.asarray(np.median(view.snr, axis=1) < SETTINGS.dark_snr)
-
-    def lit(self, waiting: Waiting) -> Float32Array:
-        """(C, N) probability that each slot of a frame is lit, by all that is known of its bursts."""
-        assert waiting.view is not None
-        assert waiting.numbers is not None
-        self.detect_stale(waiting)
-        clock = waiting.view.bursts.clock
-        lit = np.full((waiting.numbers.size, len(waiting.view.snr), clock.packet_slots), 0.5, np.float32)
-        for burst in self.of(waiting):
-            lit[waiting.numbers == burst.number] = burst.lit
-        return clock.on_grid(lit)
-
-    def doubts(self, waiting: Waiting) -> tuple[int, int]:
-        """Numbers of doubtful packets and of all packets, among complete packets of a frame in well-lit columns."""
-        assert waiting.view is not None
-        self.detect_stale(waiting)
-        lit = np.median(waiting.view.snr, axis=1) >= SETTINGS.well_lit_snr
-        doubtful = total = 0
-        for burst in self.of(waiting):
-            if burst.posteriors is not None:
-                whole = assemble.complete(burst.n_observed[None])[0] & lit
-                log_prob = burst.posteriors.log_prob[0].sum(axis=1)
-                doubtful += int((log_prob < SETTINGS.doubtful_log_prob)[whole].sum())
-                total += int(whole.sum())
-        return doubtful, total
-
-    def confidence(self, numbers: IntArray) -> Float32Array | None:
-        """(C,) of the best packet of bursts (B,) that are still going on, None where nothing is known of any."""
-        open_ones = (self._open[number] for number in numbers.tolist() if number in self._open)
-        log_probs = [burst.posteriors.log_prob for burst in open_ones if burst.posteriors is not None]
-        best = [np.exp(log_prob.sum(axis=2)).max(axis=0) for log_prob in log_probs]
-        return np.asarray(np.max(best, axis=0), np.float32) if best else None
+def doubts(view: View, bursts: Sequence[Burst]) -> tuple[int, int]:
+    """Numbers of doubtful packets and of all packets, among complete packets of a frame in well-lit columns."""
+    lit = np.median(view.snr, axis=1) >= SETTINGS.well_lit_snr
+    n_doubtful = n_whole = 0
+    for burst in bursts:
+        whole = assemble.complete(burst.n_observed[None])[0] & lit
+        log_prob = burst.posteriors.log_prob[0].sum(axis=1)[whole]
+        n_doubtful += int((log_prob < SETTINGS.doubtful_log_prob).sum())
+        n_whole += log_prob.size
+    return n_doubtful, n_whole
 
 
 def with_common_memory(metrics: Sequence[FloatArray]) -> list[FloatArray]:

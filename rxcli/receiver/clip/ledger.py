@@ -11,7 +11,7 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.clip.acquiring import Start
-from rxcli.receiver.clip.bursts import Bursts
+from rxcli.receiver.clip.bursts import Burst, bursts_of, doubts, has_light, lit_slots
 from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View, Waiting
@@ -23,6 +23,7 @@ from rxcli.receiver.sync import tracking
 from rxcli.results.dump import dump_stages
 from rxcli.types import (
     BoolArray,
+    Float32Array,
     FloatArray,
     Frame,
     FrameResult,
@@ -76,7 +77,9 @@ class Ledger:
     def __init__(self, options: ReceiverOptions) -> None:
         self._options = options
         self._waiting: deque[Waiting] = deque()
-        self._bursts = Bursts(options.skip)
+        #: Bursts that are still going on, by number; later frames add nothing to those up to `_last_closed`.
+        self._bursts: dict[int, Burst] = {}
+        self._last_closed = -1
         self._link: _Link | None = None
         self._next_number = 0
         #: Ratio of time stamps to the link's time; None if it cannot be estimated, and frames are received alone.
@@ -89,16 +92,12 @@ class Ledger:
         self.start: Start | None = None
         #: Probability that the screen's columns are numbered right.
         self.certainty = 1.0
-        self._hold_first()
+        #: Number of first frames of a scene that are held back; 0: none.
+        self._n_held = self._n_first
 
-    def _hold_first(self) -> None:
-        """Hold back the first frames of a scene."""
-        self._hold(SETTINGS.frames_held if "tracking" in self._options.skip else 0)
-
-    def _hold(self, n_frames: int) -> None:
-        """Hold back `n_frames` frames; 0: none."""
-        self._n_held = n_frames
-        self._bursts.dark_too = n_frames > 0
+    @property
+    def _n_first(self) -> int:
+        return SETTINGS.frames_held if "tracking" in self._options.skip else 0
 
     @property
     def holds_more(self) -> bool:
@@ -129,7 +128,9 @@ class Ledger:
         ends = (slot + np.array([top, bottom]) / rows_per_slot) // link.time.packet_slots
         numbers = np.unique(link.phase.burst_of(np.arange(ends[0], ends[1] + 1).astype(np.int64))) + link.offset
         lit = np.median(last.snr, axis=1) >= 1.0
-        return bool(lit.any()) and all(self._bursts.settled(int(number), lit) for number in numbers)
+        return bool(lit.any()) and all(
+            number in self._bursts and self._bursts[number].certain[lit].all() for number in numbers.tolist()
+        )
 
     def add(self, waiting: Waiting, *, scene_ends: bool = False) -> list[FrameResult]:
         """Add a frame without packets; returns the results that are complete, all of them where the scene ends."""
@@ -195,7 +196,7 @@ class Ledger:
         phase = tracking.BurstPhase(view.acquisition.repeats)
         self._link = _Link(time, phase, _shape(view), offset, frame.time_s, stamps_judged=self._stretch != 1)
         self._epoch += 1
-        self._bursts.begin()
+        self._forget_bursts()
         return first_copy
 
     def _enter_anew(self) -> list[FrameResult]:
@@ -231,15 +232,13 @@ class Ledger:
 
     def _detect(self, waiting: Waiting) -> None:
         """Add a frame to its bursts, which are detected when their result is needed, and learn from it."""
-        numbers, view = self._add(waiting), waiting.view
-        if self._options.stop_when_certain:
-            self._bursts.detect_stale(waiting)
-        going_on = any(burst.number == numbers[-1] for burst in self._bursts.of(waiting))
-        if self._scene is not None and view is not None and view.flat is not None and going_on:
-            self._scene.update(view, lambda: self._bursts.lit(waiting))
+        self._add(waiting, dark_too=self._n_held > 0)
+        view, bursts = waiting.view, self._open(waiting)
+        if self._scene is not None and view is not None and view.flat is not None and bursts:
+            self._scene.update(view, lambda: self._lit(waiting))
 
-    def _add(self, waiting: Waiting) -> IntArray:
-        """Add a frame to its bursts; returns their numbers."""
+    def _add(self, waiting: Waiting, *, dark_too: bool) -> None:
+        """Add a frame to its bursts; dark columns are detected, too, if `dark_too`."""
         view, link = waiting.view, self._link
         assert view is not None
         assert link is not None
@@ -249,8 +248,31 @@ class Ledger:
         view.bursts = replace(view.bursts, clock=replace(clock, burst=bursts - numbers[0]))
         waiting.numbers = numbers + link.offset
         self._next_number = max(self._next_number, int(waiting.numbers[-1]) + 1)
-        self._bursts.add(view, waiting.numbers)
-        return waiting.numbers
+        dark_too |= "dark_columns" not in self._options.skip
+        tried = np.ones(len(view.snr), bool) if dark_too else has_light(view)
+        for burst in bursts_of(view, waiting.numbers, tried):
+            if burst.number in self._bursts:
+                self._bursts[burst.number] += burst
+            elif burst.number > self._last_closed:
+                self._bursts[burst.number] = burst
+
+    def _open(self, waiting: Waiting) -> list[Burst]:
+        """The bursts of a frame that are still going on."""
+        numbers = [] if waiting.numbers is None else waiting.numbers.tolist()
+        return [self._bursts[number] for number in numbers if number in self._bursts]
+
+    def _lit(self, waiting: Waiting) -> Float32Array:
+        """(C, N) probability that each slot of a frame is lit."""
+        assert waiting.view is not None
+        assert waiting.numbers is not None
+        return lit_slots(waiting.view, waiting.numbers, self._open(waiting))
+
+    def _doubts(self, waiting: Waiting) -> tuple[int, int]:
+        """Numbers of doubtful packets and of all packets in well-lit columns of a frame."""
+        return (0, 0) if waiting.view is None else doubts(waiting.view, self._open(waiting))
+
+    def _forget_bursts(self) -> None:
+        self._bursts, self._last_closed = {}, -1
 
     # -- a second pass over the first frames -------------------------------------------------------------------------
 
@@ -263,13 +285,13 @@ class Ledger:
         may_wait = self._n_held < SETTINGS.frames_held_long and not at_last and not self._options.prompt
         if len(held) > 1:
             self._measure_again(held)
-            self._detect_again()
-        self._hold(SETTINGS.frames_held_long if may_wait and self._doubt(held) > SETTINGS.much_doubt else 0)
-
-    def _doubt(self, held: list[Waiting]) -> float:
-        """Share of the well lit packets of some frames that is in doubt."""
-        doubtful, whole = np.sum([self._bursts.doubts(waiting) for waiting in held], axis=0) if held else (0, 0)
-        return float(doubtful / max(whole, 1))
+            self._forget_bursts()
+            for waiting in self._waiting:
+                if waiting.numbers is not None:
+                    self._add(waiting, dark_too=False)
+        doubtful, whole = np.sum([(0, 1), *map(self._doubts, held)], axis=0)
+        in_doubt = doubtful / whole > SETTINGS.much_doubt
+        self._n_held = SETTINGS.frames_held_long if may_wait and in_doubt else 0
 
     def _can_receive_again(self, waiting: Waiting) -> bool:
         view, scene = waiting.view, self._scene
@@ -278,21 +300,9 @@ class Ledger:
     def _measure_again(self, held: list[Waiting]) -> None:
         """Learn the picture anew from all held frames, and measure doubtful frames with the picture of the others."""
         assert self._scene is not None
-        known = [self._bursts.lit(waiting) for waiting in held]
-        doubtful = [len(held) <= SETTINGS.frames_held or self._bursts.doubts(waiting)[0] > 0 for waiting in held]
+        known = [self._lit(waiting) for waiting in held]
+        doubtful = [len(held) <= SETTINGS.frames_held or self._doubts(waiting)[0] > 0 for waiting in held]
         self._scene.measure_again([w.view for w in held if w.view is not None], known, doubtful)
-
-    def _detect_again(self) -> None:
-        """The bursts of all frames that wait, each once: in the last frame that shows it."""
-        self._bursts.begin()
-        waiting = [w for w in self._waiting if w.numbers is not None]
-        numbers = [self._add(w) for w in waiting]
-        for each, following in zip(waiting, [*numbers[1:], numbers[0][:0]], strict=True):
-            ended = [burst for burst in self._bursts.of(each) if burst.number not in following]
-            self._bursts.detect(each, ended, dark_too=False)
-        tracked = [w.view for w in waiting if w.view is not None and w.view.flat is not None]
-        if self._scene is not None and tracked:
-            self._scene.last = tracked[-1]
 
     # -- results ---------------------------------------------------------------------------------------------------
 
@@ -300,7 +310,7 @@ class Ledger:
         """The results of a scene that is over, by what was known of it."""
         done = self.finish()
         self._scene = None
-        self._hold_first()
+        self._n_held = self._n_first
         return done
 
     def finish(self) -> list[FrameResult]:
@@ -328,24 +338,26 @@ class Ledger:
         return done
 
     def _report(self, waiting: Waiting, following: Waiting | None) -> FrameResult:
-        view, bursts = waiting.view, self._bursts
+        view = waiting.view
         if view is None or waiting.numbers is None:
             return waiting.result
-        bursts.detect_stale(waiting)
-        going_on = waiting.numbers[:0]
-        if following is not None and following.numbers is not None:
-            going_on = np.intersect1d(waiting.numbers, following.numbers)
+        shown = [] if following is None or following.numbers is None else following.numbers.tolist()
+        going_on = [burst for burst in self._open(waiting) if burst.number in shown]
+        closed = [burst for burst in self._open(waiting) if burst.number not in shown]
+        for burst in closed:
+            self._last_closed = max(self._last_closed, burst.number)
+            del self._bursts[burst.number]
+            waiting.skip("dark_columns", int((~burst.tried).sum()))
         n_strips = view.acquisition.sampler.binned.light.shape[1]
-        closed = bursts.close(np.setdiff1d(waiting.numbers, going_on))
         ended = [burst.ended(int(waiting.numbers[0]), n_strips) for burst in closed]
         headerless = np.zeros(len(view.snr), bool)
         if self._link is not None:
             headerless = self._link.headerless(ended, headerless.size)
-        sure = bursts.confidence(going_on)
+        sure = [np.zeros(headerless.size, np.float32), *(burst.probability for burst in going_on)]
         columns = assemble.clip_results(
             view.bursts.clock,
             ended,
-            np.zeros(headerless.size, np.float32) if sure is None else sure,
+            np.max(sure, axis=0),
             view.snr,
             headerless,
             self._options.min_confidence,

@@ -88,8 +88,6 @@ class ClipSettings:
 
     #: A burst of a column all of whose symbols have at least this log probability is not decoded again.
     certain_log_prob: float = -1e-4
-    #: Number of closed bursts whose certain columns are remembered.
-    remembered_bursts: int = 4
     #: Squared contrast over variance of a slot that is well lit, and log probability of a packet in doubt.
     well_lit_snr: float = 10.0
     doubtful_log_prob: float = -0.05
