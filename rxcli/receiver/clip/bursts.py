@@ -34,15 +34,15 @@ class Burst:
     #: (C,) columns with enough light in any of them; the others are not detected.
     tried: BoolArray
 
-    def __add__(self, other: Burst) -> Burst:
-        metrics, more = with_common_memory([self.metrics, other.metrics])
+    def __add__(self, burst: Burst) -> Burst:
+        metrics, more = with_common_memory([self.metrics, burst.metrics])
         return Burst(
             self.number,
             metrics + more,
-            self.n_observed + other.n_observed,
-            self.frames + other.frames,
-            self.tracked or other.tracked,
-            self.tried | other.tried,
+            self.n_observed + burst.n_observed,
+            self.frames + burst.frames,
+            self.tracked or burst.tracked,
+            self.tried | burst.tried,
         )
 
     @cached_property
