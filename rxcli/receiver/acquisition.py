@@ -74,21 +74,6 @@ class Acquisition:
         clock = replace(self.clock, delay_slots=self.clock.delay_slots[part])
         return replace(self, sampler=ColumnSampler(chosen, chosen), clock=clock)
 
-    def as_one_column(self) -> Acquisition:
-        """The acquisition with every column as a strip of a single one."""
-        profiles, rows = self.profiles, self.profiles.sensor_row
-        weight = profiles.inside.astype(np.float32)
-        light = (profiles.light * weight).sum(axis=1) / np.maximum(weight.sum(axis=1), 1)
-        strips = replace(
-            profiles,
-            light=np.asarray(light[None], np.float32),
-            inside=np.any(profiles.inside, axis=1)[None],
-            count=np.asarray(profiles.count.sum(axis=1)[None], np.float32),
-            sensor_row=None if rows is None else rows.mean(axis=1)[None],
-        )
-        clock = replace(self.clock, delay_slots=np.zeros(1))
-        return replace(self, sampler=ColumnSampler(strips, strips), clock=clock)
-
 
 def n_strips_of(corners: FloatArray, n_columns: int) -> int:
     """Number of lateral strips of a column, from its width."""

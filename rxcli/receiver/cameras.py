@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import ReadoutMode, match_camera
+from rxcli.profiles import CameraProfile, ReadoutMode, match_camera
 from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure
 from rxcli.receiver.screen import geometry
 from rxcli.types import Frame, Lens
@@ -11,22 +11,22 @@ from rxcli.types import Frame, Lens
 
 def has_profile(frame: Frame, options: ReceiverOptions) -> bool:
     """Whether a profile describes the frame's camera."""
+    return _profile_of(frame, options) is not None
+
+
+def _profile_of(frame: Frame, options: ReceiverOptions) -> CameraProfile | None:
     meta = frame.metadata
-    found = match_camera(options.cameras, meta.make, meta.model, frame.width, frame.height)
-    return options.force_camera or found is not None
+    if options.force_camera:
+        return options.cameras[0]
+    return match_camera(options.cameras, meta.make, meta.model, frame.width, frame.height)
 
 
 def known_camera(frame: Frame, options: ReceiverOptions) -> Camera | Failure | None:
     """Camera from the matching profile, or None."""
-    meta = frame.metadata
-    profile = (
-        options.cameras[0]
-        if options.force_camera
-        else match_camera(options.cameras, meta.make, meta.model, frame.width, frame.height)
-    )
-    mode = profile.mode_for(frame.width, frame.height) if profile else None
+    profile = _profile_of(frame, options)
     if profile is None:
         return None
+    mode = profile.mode_for(frame.width, frame.height)
     if mode is None:
         return Failure(
             "no_signal",

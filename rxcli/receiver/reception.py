@@ -116,12 +116,16 @@ def headerless(reception: Reception) -> NDArray[np.bool_]:
     return out
 
 
+def contrast_of(reception: Reception) -> tuple[Float32Array, Float32Array]:
+    """(C, n) light of the columns between its local extremes, and its weight; see `sync.contrast`."""
+    samples = reception.samples
+    return sync.contrast(samples.light, samples.valid, samples.samples_per_slot, reception.model.noise.sigma)
+
+
 def shows_steady_light(reception: Reception) -> bool:
     """Whether the light is that of a lamp or of a screen dimmed by switching."""
-    samples, clock = reception.samples, reception.clock
-    contrast = sync.contrast(samples.light, samples.valid, samples.samples_per_slot, reception.model.noise.sigma)
-    lit = clock.on_grid(reception.posteriors.lit)
-    return is_steady(*contrast, lit, clock.packet_slots)
+    lit = reception.clock.on_grid(reception.posteriors.lit)
+    return is_steady(*contrast_of(reception), lit, reception.clock.packet_slots)
 
 
 def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:

@@ -15,8 +15,7 @@ class WiringSettings:
     #: 10, with packets at least 74 in 120 hard pictures.
     min_packets_llr: float = 20.0
 
-    #: Samples per slot for comparing columns, and their largest shift, slots: blinds may be slanted.
-    light_samples: int = 2
+    #: Largest shift of the light of one lamp between columns, slots: blinds may be slanted.
     max_column_shift_slots: int = 10
     #: Detection of switched light without a clock: smoothing and longest period, rows; minimum explained share.
     smooth_rows: int = 2

@@ -99,6 +99,13 @@ def _initial_slots(metrics: FloatArray, isi_memory: int) -> Float32Array:
     return detect.detect(metrics, detect.plausible_weights(metrics, 0.0)).lit
 
 
+def as_one_column(reception: Reception) -> Reception:
+    """Receive all columns as one that sends the same."""
+    middle = reception.of_columns(np.array([reception.snr.shape[0] // 2]))
+    metrics = reception.metrics.sum(axis=0, keepdims=True)
+    return replace(middle, metrics=metrics, posteriors=_detect(metrics, middle.clock))
+
+
 def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
     """Columns with a complete packet of low confidence."""
     return np.flatnonzero(has_doubtful_packet(reception, STILL.doubtful))

@@ -10,6 +10,11 @@ from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import Strips, levelled
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
+NO_HEADERS = (
+    "there are stripes but no packet header where it should be; the screen may show less than one packet (move "
+    "closer), the picture may be merged from several exposures (switch HDR off), or the screen is none of those tried"
+)
+
 
 def why_not(strips: Strips) -> str:
     """Why no clock was found: what the picture looks like, and the next step."""
@@ -34,11 +39,7 @@ def why_not(strips: Strips) -> str:
             f"the stripes are about {width:.1f} rows wide, too few to separate slots (at least "
             f"{SETTINGS.min_rows_per_slot} rows a slot); use the picture in its full size, or a slower slot rate"
         )
-    return (
-        "there are stripes but no packet header where it should be; the screen may show less than one packet (move "
-        "closer), the picture may be merged from several exposures (switch HDR off), or the screen is none of those "
-        "tried"
-    )
+    return NO_HEADERS
 
 
 def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:

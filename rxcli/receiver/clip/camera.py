@@ -156,7 +156,8 @@ class ClipCamera:
         """
         context = located.context
         if predicted is not None:
-            return self, light_without_data(context, predicted) or Settled(context, predicted)
+            initial = initial_pass(predicted)
+            return self, light_without_data(context, initial) or Settled(context, predicted, initial)
         found = located.found or self._search_at(context, context)
         if isinstance(found, Failure):
             return self, found

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from rxcli.receiver.acquisition import sample_columns
+from rxcli.receiver.camera.advice import NO_HEADERS
 from rxcli.receiver.context import Failure
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.search.hypothesis import Hypothesis
@@ -12,10 +13,6 @@ from rxcli.receiver.search.nulls import STEADY_LIGHT, is_switched
 from rxcli.receiver.search.propose import Proposer
 
 _NO_HEADER = "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
-NO_HEADERS = (
-    "there are stripes but no packet header where it should be; the screen may show less than one packet (move "
-    "closer), the picture may be merged from several exposures (switch HDR off), or the screen is none of those tried"
-)
 
 
 def why_no_packets(proposer: Proposer, nearest: Hypothesis | None, failure: Failure | None) -> Failure:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS
-from rxcli.receiver.acquisition import Acquisition, noise_of
+from rxcli.receiver.acquisition import noise_of
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.steady import is_common_light, periodic_share
-from rxcli.receiver.reception import shows_steady_light
+from rxcli.receiver.reception import Reception, contrast_of, shows_steady_light
 from rxcli.receiver.settings import SETTINGS
-from rxcli.receiver.still import initial_pass
+from rxcli.receiver.still import as_one_column
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import RowProfiles
 
@@ -23,7 +23,7 @@ STEADY_LIGHT = (
 _ONE_LAMP = f"all columns show the same light and no packets in it, as of a single lamp; {_NEXT}"
 
 
-def light_without_data(context: FrameContext, acquisition: Acquisition) -> Failure | None:
+def light_without_data(context: FrameContext, reception: Reception) -> Failure | None:
     """Failure of a screen with a clock whose light carries no data, or None.
 
     The link consists of independent columns. If all columns are equal they are received as one: a screen that sends the
@@ -32,15 +32,12 @@ def light_without_data(context: FrameContext, acquisition: Acquisition) -> Failu
     if all(too_small(context, screen) for screen in context.screens):
         return None  # No packet fits, and light of few rows is periodic for some period.
     with context.timer("detect"):
-        binned = acquisition.binned()
-        samples = sync.sample_slots(binned.profiles, binned.clock, SETTINGS.light_samples)
-        contrast = sync.contrast(samples.light, samples.valid, SETTINGS.light_samples, noise_of(binned.profiles))
-        headers = PREAMBLE_SLOTS / binned.screen.packet_slots
-        if not is_common_light(*contrast, headers, SETTINGS.max_column_shift_slots * SETTINGS.light_samples):
+        headers, q = PREAMBLE_SLOTS / reception.clock.packet_slots, reception.samples.samples_per_slot
+        if not is_common_light(*contrast_of(reception), headers, SETTINGS.max_column_shift_slots * q):
             return None
-        reception = initial_pass(binned.as_one_column())
-        no_header = bool(np.any(assemble.find_headerless(reception.posteriors.header_llr)))
-        if float(reception.column_llr.max()) > SETTINGS.min_packets_llr and not no_header:
+        one = as_one_column(reception)
+        no_header = bool(np.any(assemble.find_headerless(one.posteriors.header_llr)))
+        if float(one.column_llr.max()) > SETTINGS.min_packets_llr and not no_header:
             return None
         return Failure("no_signal", STEADY_LIGHT if shows_steady_light(reception) else _ONE_LAMP)
 

@@ -66,7 +66,7 @@ def search(
     if best.evidence >= SETTINGS.few_packets:
         outlines = less_likely_outlines(best, outlines, proposer)
     chosen = numbered(best.hypothesis.outline, outlines, walk.score_of)
-    refused = light_without_data(best.context, best.acquisition)
+    refused = light_without_data(best.context, best.reception)
     if refused is not None:
         return replace(refused, outline=chosen, context=best.context, tried=walk.record(best, "no data"))
     chosen = replace(chosen, corners=_corners_by_slots(chosen, best))
@@ -124,9 +124,7 @@ class _Walk:
             self._score(hypothesis)
             if self._is_hopeless():
                 break
-        best = self._best()
-        was_fitted = best is not None and SETTINGS.bail < best.evidence < SETTINGS.plain
-        return best if best is None or was_fitted else self._fitted(best)
+        return self._best()
 
     def _fitted(self, best: Scored) -> Scored:
         """The same with an estimated camera fitted to its slots until the clock no longer moves."""
@@ -209,7 +207,7 @@ class _Walk:
                 self._tried.append(Tried(hypothesis, half.evidence, half.score, "half"))
                 return
         scored = self._measured(hypothesis, acquisition)
-        if SETTINGS.bail < scored.evidence < SETTINGS.plain:
+        if scored.evidence > SETTINGS.bail:
             # Packets may become certain once an estimated camera is fitted: then no other camera is tried.
             scored = self._fitted(scored)
         bursts = replace(hypothesis, bursts=tuple(scored.reception.clock.burst.tolist()))

@@ -8,7 +8,7 @@ of different bursts are not, which gives the burst boundaries.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -370,22 +370,26 @@ def possible_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> 
     """
     scores = copy_similarity(llr, clock)
     out: dict[bytes, tuple[Clock, float]] = {}
-    for n, phase in [(copies, phase) for copies in repeats for phase in range(copies)]:
-        burst = (np.arange(clock.n_copies) + phase) // n
+    for _, burst in _assignments(clock.n_copies, repeats):
         score = float(np.where(burst[1:] == burst[:-1], scores, -scores).sum())
-        burst -= burst[0]
         out.setdefault(burst.tobytes(), (replace(clock, burst=burst), score))
     return sorted(out.values(), key=lambda assignment: -assignment[1])
 
 
 def likely_repeats(clock: Clock, repeats: Sequence[int]) -> int:
     """The first of `repeats` that is consistent with the assigned bursts."""
+    assigned = clock.burst - clock.burst[0]
+    return next(
+        (n for n, burst in _assignments(clock.n_copies, repeats) if np.array_equal(burst, assigned)), repeats[0]
+    )
+
+
+def _assignments(n_copies: int, repeats: Sequence[int]) -> Iterator[tuple[int, IntArray]]:
+    """Every number of copies of a burst, and (n_copies,) bursts with it, from 0."""
     for n in repeats:
         for phase in range(n):
-            burst = (np.arange(clock.n_copies) + phase) // n
-            if np.array_equal(burst - burst[0], clock.burst - clock.burst[0]):
-                return n
-    return repeats[0]
+            burst = (np.arange(n_copies) + phase) // n
+            yield n, burst - burst[0]
 
 
 def copy_similarity(llr: Float32Array, clock: Clock) -> FloatArray:
