@@ -26,26 +26,36 @@ def curvature_terms(x: FloatArray, rows: FloatArray, width: int, height: int) ->
     return width * np.stack([down * square, down * square**2, square + 2 * down**2, 2 * across * down])
 
 
+#: k1 k2 p1 p2 of a unit of bend: lenses bend back further out, k2 is about -k1.
+_UNIT: FloatArray = np.array([1.0, -1.0, 0.0, 0.0])
+
+
 def straightened(strips: Strips, level: Float32Array, curvature: FloatArray) -> Float32Array:
     """(M, R) levelled light read along the bent stripes: every row of the result is one sensor row, 0 out of view."""
-    if not curvature.any():
-        return level
-    terms = curvature_terms(strips.x, strips.rows, strips.width, strips.height)
-    moved = np.tensordot(curvature, terms, 1) / strips.pitch
-    index = np.arange(strips.rows.size)
-    # Row r shows sensor row r + moved(r); sensor row s is found at s - moved(s), to first order of a small slope.
+    return _moved(level, _moved_rows(strips, 1, curvature)) if curvature.any() else level
+
+
+def likeliest_bend(strips: Strips, level: Float32Array) -> FloatArray:
+    """(4,) bend, other than none, under which the levelled light (M, R) of neighbouring columns is most similar."""
+    strips_per_column = level.shape[0] // strips.n_columns
+    level, moved = level[::strips_per_column], _moved_rows(strips, strips_per_column, _UNIT)
+    bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, 16)
+    straight = (_moved(level, bend * moved) for bend in bends)
+    return np.asarray(bends[np.argmax([(light[:-1] * light[1:]).sum() for light in straight])] * _UNIT)
+
+
+def _moved_rows(strips: Strips, step: int, curvature: FloatArray) -> FloatArray:
+    """(M / step, R) rows by which a bend moves every row of each `step`-th strip."""
+    terms = curvature_terms(strips.x[::step], strips.rows, strips.width, strips.height)
+    return np.asarray(np.tensordot(curvature, terms, 1) / strips.pitch)
+
+
+def _moved(level: Float32Array, moved: FloatArray) -> Float32Array:
+    """Row r shows sensor row r + moved(r); sensor row s is found at s - moved(s), to first order of a small slope."""
+    index = np.arange(level.shape[1])
     back = np.take_along_axis(moved, np.clip(np.rint(index - moved), 0, index[-1]).astype(np.int64), 1)
     place = np.clip(index - back, 0, index[-1] - 1e-6)
     low = place.astype(np.int64)
     below, above = np.take_along_axis(level, low, 1), np.take_along_axis(level, low + 1, 1)
     out = below + (above - below) * (place - low).astype(np.float32)
     return np.asarray(out * (np.abs(index - back - place) < 0.5), np.float32)
-
-
-def likeliest_bend(strips: Strips, level: Float32Array) -> FloatArray:
-    """(4,) bend, other than none, under which the levelled light (M, R) of neighbouring columns is most similar."""
-    # Lenses bend back further out: k2 is about -k1.
-    bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, 16)[:, None] * np.array([1.0, -1.0, 0.0, 0.0])
-    straight = (straightened(strips, level, bend) for bend in bends)
-    column = level.shape[0] // strips.n_columns
-    return np.asarray(bends[np.argmax([(light[:-column] * light[column:]).sum() for light in straight])])
