@@ -16,7 +16,17 @@ from rxcli.receiver.decode.soft_bits import assume_unobserved_certain, still_sof
 from rxcli.receiver.decode.steady import is_steady
 from rxcli.receiver.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, Frame, FrameSoftBits, IntArray, SlotSamples
+from rxcli.types import (
+    BoolArray,
+    BurstPosteriors,
+    Clock,
+    Float32Array,
+    FloatArray,
+    Frame,
+    FrameSoftBits,
+    IntArray,
+    SlotSamples,
+)
 
 
 @dataclass(frozen=True)
@@ -44,6 +54,11 @@ class Reception:
         packets = self.posteriors.log_evidence - np.log(len(WEIGHTS))
         share = self.posteriors.w / SLOTS_PER_SYMBOL
         return np.asarray(packets - detect.free_log_evidence(self.metrics, share))
+
+    @cached_property
+    def is_complete(self) -> BoolArray:
+        """(B, C) packets with all payload slots observed."""
+        return assemble.complete(assemble.slots_observed(self.samples, self.clock))
 
     @property
     def payload_lit(self) -> Float32Array:
@@ -139,19 +154,12 @@ def has_doubtful_packet(reception: Reception, certain: float) -> NDArray[np.bool
     doubtful = (reception.packet_confidence < certain) & (
         reception.posteriors.log_prob.min(axis=2) < SETTINGS.beyond_doubt_log_prob
     )
-    return np.asarray((doubtful & complete_packets(reception)).any(axis=0))
-
-
-def complete_packets(reception: Reception) -> NDArray[np.bool_]:
-    """(B, C) packets with all payload slots observed."""
-    return assemble.complete(assemble.slots_observed(reception.samples, reception.clock))
+    return np.asarray((doubtful & reception.is_complete).any(axis=0))
 
 
 def best_log_prob(reception: Reception) -> FloatArray:
     """(C,) mean log probability of the symbols of each column's surest complete packet."""
-    return np.asarray(
-        np.where(complete_packets(reception), reception.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0)
-    )
+    return np.asarray(np.where(reception.is_complete, reception.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0))
 
 
 def slot_margin(reception: Reception) -> Float32Array:

@@ -19,7 +19,6 @@ from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, slot_llr
 from rxcli.receiver.reception import (
     Reception,
     best_log_prob,
-    complete_packets,
     dark_columns,
     has_doubtful_packet,
     packet_llr,
@@ -45,7 +44,7 @@ def decode_photograph(acquisition: Acquisition, skip: frozenset[str], initial: R
 
 def _may_show_packets(initial: Reception) -> bool:
     """Whether the initial pass may contain a packet."""
-    if (initial.packet_confidence[complete_packets(initial)] > STILL.doubtful).any():
+    if (initial.packet_confidence[initial.is_complete] > STILL.doubtful).any():
         return True
     return packet_llr(initial) + max(float(initial.posteriors.header_llr.sum()), 0.0) > SETTINGS.min_packets_llr
 

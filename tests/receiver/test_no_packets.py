@@ -56,7 +56,7 @@ def test_only_what_may_show_packets_is_looked_at_in_depth(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     acquisition = Acquisition(None, None, CLOCK)  # type: ignore[arg-type]
-    monkeypatch.setattr(still, "complete_packets", lambda one: np.ones((1, 3), bool))
+    monkeypatch.setattr(Reception, "is_complete", np.ones((1, 3), bool))
     monkeypatch.setattr(Reception, "packet_confidence", np.full((1, 3), confidence))
     seen: list[str] = []
     monkeypatch.setattr(still, "decode", lambda *rest: (seen.append("decode"), rest[2])[1])

@@ -71,8 +71,9 @@ def _proposed(*rows_per_slot: float) -> list[blind.CameraHypothesis]:
             score=100.0,
             rows_per_slot_sd=0.01,
             curvature_sd=np.zeros(4),
+            number=number,
         )
-        for rows in rows_per_slot
+        for number, rows in enumerate(rows_per_slot)
     ]
 
 

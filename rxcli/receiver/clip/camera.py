@@ -15,7 +15,7 @@ from rxcli.receiver.cameras import has_profile
 from rxcli.receiver.clip.acquiring import Start, agree, shows_little
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
-from rxcli.receiver.reception import Reception, complete_packets, has_clear_packets
+from rxcli.receiver.reception import Reception, has_clear_packets
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.nulls import light_without_data
 from rxcli.receiver.still import decode_photograph, doubtful_columns, initial_pass
@@ -237,7 +237,7 @@ def _shows_packets(reception: Reception, doubt: float) -> bool:
 
     If packets are complete, the share of doubtful columns must be below `doubt`; else the slots must resemble packets.
     """
-    return _doubt_of(reception) < doubt if complete_packets(reception).any() else has_clear_packets(reception)
+    return _doubt_of(reception) < doubt if reception.is_complete.any() else has_clear_packets(reception)
 
 
 def _kind_of(frame: Frame) -> tuple[object, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.receiver.reception import Reception, complete_packets
+from rxcli.receiver.reception import Reception
 from rxcli.receiver.search.hypothesis import Scored
 from rxcli.receiver.search.settings import SETTINGS
 
@@ -31,7 +31,7 @@ def score(reception: Reception, evidence: float, log_prior: float) -> float:
         evidence: see `log_evidence`.
         log_prior: of the hypothesis.
     """
-    complete = SETTINGS.complete_packet * bool(complete_packets(reception).any())
+    complete = SETTINGS.complete_packet * bool(reception.is_complete.any())
     return SETTINGS.temper * (distinct_share(reception) * evidence + complete) + log_prior
 
 

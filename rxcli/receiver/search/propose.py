@@ -14,7 +14,7 @@ from rxcli.receiver.cameras import known_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.light import slot_llr
-from rxcli.receiver.reception import Reception, complete_packets
+from rxcli.receiver.reception import Reception
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.outlines import likeliest_of_family
 from rxcli.receiver.search.settings import SETTINGS
@@ -113,16 +113,11 @@ class Proposer:
 
     def with_clock(self, hypothesis: Hypothesis) -> Hypothesis | None:
         """The hypothesis with its columns and its clock, or None if no header is found."""
-        n_columns = hypothesis.screen.columns
-        usual = _nearest((hypothesis.screen, *self.options.screens), _USUAL_COLUMNS).columns
-        # A header is found on columns of any width, so narrow ones are read only after it was found on wide ones.
-        for n in dict.fromkeys((usual, n_columns)):
-            sampler = sample_columns(self.context(hypothesis), n)
-            with self.timer("clock"):
-                clock = _clock(hypothesis, sampler)
-            if clock is None or clock.header_peak_ratio < SETTINGS.min_lead:
-                return None
-        assert clock is not None
+        sampler = sample_columns(self.context(hypothesis), hypothesis.screen.columns)
+        with self.timer("clock"):
+            clock = _clock(hypothesis, sampler)
+        if clock is None or clock.header_peak_ratio < SETTINGS.min_lead:
+            return None
         lead = np.log(clock.header_peak_ratio / SETTINGS.clear_lead)
         log_prior = hypothesis.log_prior + SETTINGS.lead_weight * min(float(lead), 0.0)
         has_same_copies = hypothesis.bursts is not None and len(hypothesis.bursts) == clock.n_copies
@@ -155,7 +150,7 @@ class Proposer:
     def _of_other_bursts(self, scored: Scored) -> Iterator[Hypothesis]:
         """Other bursts of the same copies, if packets are uncertain."""
         reception, repeats = scored.reception, scored.acquisition.repeats
-        complete = complete_packets(reception)
+        complete = reception.is_complete
         possible = sync.possible_bursts(reception.clock, slot_llr(reception.metrics), repeats)
         plain = len(possible) == 1 or possible[0][1] - possible[1][1] > SETTINGS.plain_bursts
         if complete.any() and plain and np.array_equal(possible[0][0].burst, reception.clock.burst):
@@ -173,7 +168,7 @@ class Proposer:
 
 def _is_clear(reception: Reception) -> bool:
     """Whether nearly all columns have a complete packet of high confidence."""
-    confidence = np.where(complete_packets(reception), reception.packet_confidence, 0.0).max(axis=0)
+    confidence = np.where(reception.is_complete, reception.packet_confidence, 0.0).max(axis=0)
     return bool((confidence > SETTINGS.clear_confidence).mean() >= SETTINGS.clear_columns)
 
 
