@@ -35,9 +35,9 @@ def light_without_data(context: FrameContext, reception: Reception) -> Failure |
         headers, q = PREAMBLE_SLOTS / reception.clock.packet_slots, reception.samples.samples_per_slot
         if not is_common_light(*contrast_of(reception), headers, SETTINGS.max_column_shift_slots * q):
             return None
-        one = as_one_column(reception)
-        no_header = bool(np.any(assemble.find_headerless(one.posteriors.header_llr)))
-        if float(one.column_llr.max()) > SETTINGS.min_packets_llr and not no_header:
+        joint = as_one_column(reception)
+        no_header = bool(np.any(assemble.find_headerless(joint.posteriors.header_llr)))
+        if float(joint.column_llr.max()) > SETTINGS.min_packets_llr and not no_header:
             return None
         return Failure("no_signal", STEADY_LIGHT if shows_steady_light(reception) else _ONE_LAMP)
 
