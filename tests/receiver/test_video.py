@@ -457,6 +457,22 @@ def test_errors_that_rows_have_in_common_count_as_one(together: int) -> None:
     assert np.median(judged.precision) == pytest.approx(expected, rel=0.1)
 
 
+def test_black_parts_of_a_picture_show_no_slots() -> None:
+    """The black bar of a letterboxed picture, whose slots are unknown: it is black whatever is sent."""
+    rng = np.random.default_rng(12)
+    known = KnownPicture(
+        np.ones((3, 4, 300), bool), Crosstalk(np.tile([0.0, 1.0, 0.0], (4, 1))), 0.0, NoiseModel(1e-7, 1e-4)
+    )
+    slots = np.repeat(rng.integers(0, 2, (3, 60)), 5, axis=1).astype(np.float32)
+    light = (0.3 * slots[:, None] + rng.normal(0, 3e-4, (3, 4, 300))).astype(np.float32)
+    slots[:, 200:] = 0.5
+    light[..., 200:] = rng.normal(0, 3e-4, (3, 4, 100))
+    known.learn(Observation(light, slots, np.abs(2 * slots - 1)))
+    precision = known.solve(light).precision
+    assert np.median(precision[:, :200]) > 50
+    assert np.median(precision[:, 250:]) < 0.2
+
+
 def test_rows_that_were_never_lit_are_not_known() -> None:
     """Light that neighbours spill is no look at a picture: what is lit there at last is not taken for dark."""
     known = KnownPicture(

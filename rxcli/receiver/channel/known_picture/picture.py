@@ -82,8 +82,8 @@ class KnownPicture:
         self._crosstalk = crosstalk.shares.astype(np.float32)
         self._black_level = np.asarray(black_level, np.float32)[..., None]
         self._noise = noise
-        self._light: Float32Array = np.zeros(inside.shape, np.float32)
-        self._observed: Float32Array = np.zeros(inside.shape, np.float32)
+        #: (4, C, S, R) sums over the frames, see `_update_of`.
+        self._sums: Float32Array = np.zeros((4, *inside.shape), np.float32)
         self._system: _System | None = None
         self._of_one: Float32Array | None = None
         #: Cached picture and relative variance; None after a change.
@@ -114,10 +114,8 @@ class KnownPicture:
 
     def learn(self, observation: Observation, *, forget: bool = True) -> None:
         """Update the picture by a frame with known slots; with `forget`, earlier frames lose some weight."""
-        lit, observed = self._update_of(observation)
         keep = np.float32(SETTINGS.memory_share if forget else 1.0)
-        self._light = self._light * keep + lit
-        self._observed = self._observed * keep + observed
+        self._sums = self._sums * keep + self._update_of(observation)
         self._system = self._made = self._placed = None
 
     def without(self, observation: Observation) -> KnownPicture:
@@ -126,27 +124,30 @@ class KnownPicture:
         A picture that contains a frame's own light would confirm its decisions, wrong or right.
         """
         rest = copy(self)
-        lit, observed = self._update_of(observation)
-        rest._light, rest._observed = rest._light - lit, np.maximum(rest._observed - observed, 0)
+        rest._sums = self._sums - self._update_of(observation)
+        np.maximum(rest._sums[1:], 0, out=rest._sums[1:])
         rest._system = rest._made = rest._placed = None
         rest._excess = self._excess.copy()
         return rest
 
-    def _update_of(self, observation: Observation) -> tuple[Float32Array, Float32Array]:
-        """Light and predicted light of a picture of 1, each weighted by the latter, on the rows of the picture."""
+    def _update_of(self, observation: Observation) -> Float32Array:
+        """(4, C, S, R) sums on the rows of the picture, two by the slots and two whatever was sent.
+
+        Light and predicted light of a picture of 1, each weighted by the latter; predicted and measured mean light, as
+        half of the slots are lit.
+        """
         placement = observation.placement
         expected = self._crosstalk @ _with_neighbours(observation.slots)
         doubt = self._crosstalk @ (1 - _with_neighbours(observation.trust, 1.0))
-        inside = self._inside if placement is None else placement.inside
+        inside = self._inside if placement is None else placement.inside.astype(np.float32)
         # If little light was predicted, the observed light may come from other slots.
         power = expected * expected
         known = power / (power + np.float32(SETTINGS.prediction_error) + np.float32(SETTINGS.uncertain_error) * doubt)
         weighted = expected * (known * known) * np.maximum(1 - np.float32(SETTINGS.doubt_weight) * doubt, 0) * inside
-        lit, observed = weighted * (observation.light - self._black_level), weighted * expected
+        light = observation.light - self._black_level
+        sums = np.stack([weighted * light, weighted * expected, np.float32(0.5) * inside, inside * light])
         row = observation.frame_row
-        if row is None:
-            return lit, observed
-        return _resampled(lit, row, beyond=True), _resampled(observed, row, beyond=True)
+        return sums if row is None else np.stack([_resampled(values, row, beyond=True) for values in sums])
 
     def solve(self, light: Float32Array) -> ColumnLight:
         """Solve for the columns' own light in a frame.
@@ -237,26 +238,21 @@ class KnownPicture:
 
     def _make(self) -> tuple[Float32Array, Float32Array]:
         wide, smooth = np.float32(SETTINGS.wide_weight), np.float32(SETTINGS.smooth_weight)
-        near = box_sums(self._observed, SETTINGS.around_rows) + wide
-        around = (box_sums(self._light, SETTINGS.around_rows) + wide * self._wide()[:, None]) / near
-        total = self._observed + smooth
-        picture = np.maximum(self._light + smooth * around, 0) / total
+        light, observed, *mean = self._sums
+        usual, usual_light = (box_sums(values, SETTINGS.wide_rows) for values in mean)
+        near = box_sums(observed, SETTINGS.around_rows) + wide
+        usual_light /= np.maximum(usual, np.float32(0.1))
+        around = (box_sums(light, SETTINGS.around_rows) + wide * usual_light) / near
+        total = observed + smooth
+        picture = np.maximum(light + smooth * around, 0) / total
         # Crosstalk alone is no observation of the picture, whose error may then be arbitrarily large.
         unknown = wide / near
         error = np.float32(SETTINGS.around_error**2) + np.float32(SETTINGS.wide_error**2) * unknown * unknown
         error *= smooth * smooth
-        error += np.float32(SETTINGS.row_error) * self._observed
+        error += np.float32(SETTINGS.row_error) * observed
         error /= total * total
         error += np.float32(SETTINGS.min_error**2)
         return picture, error
-
-    def _wide(self) -> Float32Array:
-        """(C, R) mean of the picture over a column's strips and many rows."""
-        light, observed = (values.sum(axis=1) for values in (self._light, self._observed))
-        usual = light.sum() / max(float(observed.sum()), 1e-6)
-        some = np.float32(SETTINGS.wide_weight)
-        wide = (box_sums(light, SETTINGS.wide_rows) + some * usual) / (box_sums(observed, SETTINGS.wide_rows) + some)
-        return np.asarray(wide, np.float32)
 
     def _factor(self, measured: Float32Array | None = None) -> _System:
         """Factor the normal equations A m = b of every row, A symmetric with two bands: A = L D L', and diag(A^-1)."""

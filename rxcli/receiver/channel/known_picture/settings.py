@@ -23,9 +23,9 @@ class KnownPictureSettings:
     #: Relative error of an interpolated picture, and of a well observed one.
     around_error: float = 0.6
     min_error: float = 0.02
-    #: Rows on each side, over all strips of a column, that provide the picture if the neighbouring rows were not lit
-    #: either; relative weight, and relative error, which is common to neighbouring rows.
-    wide_rows: int = 60
+    #: Rows on each side whose mean light provides the picture if the neighbouring rows were not lit either; relative
+    #: weight, and relative error, which is common to neighbouring rows.
+    wide_rows: int = 40
     wide_weight: float = 0.1
     wide_error: float = 2.0
     #: Squared error of the light of a row, relative to full light, times the rows of a slot, which share it: wrong
