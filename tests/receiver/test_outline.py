@@ -12,7 +12,8 @@ from rxcli.receiver.context import Outline, Timer
 from rxcli.receiver.corners import possible_screens
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.grid import grid_between
-from rxcli.receiver.search.outlines import likeliest_of_family, numbered
+from rxcli.receiver.search.numbers import numbered
+from rxcli.receiver.search.propose import likeliest_of_family
 from rxcli.types import FloatArray, Frame
 
 HEIGHT, WIDTH, ROWS_PER_SLOT, COLUMNS = 1600, 1200, 10.0, 20

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,9 +19,6 @@ _DEGREES = 4.0
 _MIN_DENSITY = np.float32(1e-37)
 #: Samples per batch, limited by the cache.
 _SAMPLES_AT_A_TIME = 60_000
-#: Threads, which gain time because NumPy releases the interpreter's lock; and the number of batches below which
-#: waiting for that lock costs more than threads gain.
-_THREADS, _MANY_PARTS = 2, 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,18 +57,11 @@ def slot_likelihoods(
     """
     expected, light = model.expected(lit, clock, columns, slope=timing), model.over_black(samples)
 
-    def of_part(part: NDArray[np.int64]) -> SlotLikelihoods:
-        return _likelihoods(_Part.of(light[part], samples.valid[part], expected.of(part), model), thorough)
-
     n_parts = int(np.clip(round(samples.light.size / _SAMPLES_AT_A_TIME), 1, columns.size))
-    if n_parts == 1:
-        return of_part(np.arange(columns.size))
-    parts = np.array_split(np.arange(columns.size), n_parts)
-    if n_parts < _MANY_PARTS:
-        done = [of_part(part) for part in parts]
-    else:
-        with ThreadPoolExecutor(_THREADS) as pool:
-            done = list(pool.map(of_part, parts))
+    done = [
+        _likelihoods(_Part.of(light[part], samples.valid[part], expected.of(part), model), thorough)
+        for part in np.array_split(np.arange(columns.size), n_parts)
+    ]
     return SlotLikelihoods(
         np.concatenate([d.metrics for d in done]),
         np.concatenate([d.snr for d in done]),

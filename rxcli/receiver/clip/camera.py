@@ -17,7 +17,7 @@ from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
 from rxcli.receiver.reception import Reception, has_clear_packets
 from rxcli.receiver.search import Found, search
-from rxcli.receiver.search.nulls import light_without_data
+from rxcli.receiver.search.refusal import light_without_data
 from rxcli.receiver.still import decode_photograph, doubtful_columns, initial_pass
 from rxcli.receiver.unknown_camera import settle
 from rxcli.types import FloatArray, Frame

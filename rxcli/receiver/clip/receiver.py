@@ -26,7 +26,7 @@ from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.reception import Reception, shows_steady_light
 from rxcli.receiver.search import Found
-from rxcli.receiver.search.nulls import STEADY_LIGHT
+from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode
 from rxcli.receiver.sync import tracking
 from rxcli.types import FloatArray, Frame, FrameResult

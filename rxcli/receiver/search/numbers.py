@@ -5,7 +5,7 @@ Outlines of one family share all columns but the outermost. A column of the scre
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -48,6 +48,29 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
             log_odds = outlines[index].log_odds + SETTINGS.outer_weight * min(gain, 0.0)
             out[index] = replace(outlines[index], log_odds=log_odds)
     return out
+
+
+def numbered(own: Outline, outlines: Sequence[Outline], score_of: Callable[[int], float | None]) -> Outline:
+    """An outline with the probability that its columns are numbered as the screen's.
+
+    Packets do not depend on which column is the first, so within a family the prior alone decides; between families
+    the scores do.
+
+    Args:
+        own: the outline that was chosen.
+        outlines: all that were proposed.
+        score_of: the best score under outlines of a family, or None if none was tried.
+    """
+    family_odds = np.array([outline.log_odds for outline in outlines if outline.family == own.family])
+    families = {outline.family for outline in outlines}
+    scores = np.array([score for family in families if (score := score_of(family)) is not None])
+    mine = score_of(own.family)
+    certainty = own.certainty / float(np.exp(np.sort(family_odds) - own.log_odds).sum())
+    if mine is not None:
+        certainty /= float(np.exp(np.sort(scores) - mine).sum())
+    return replace(
+        own, certainty=certainty, column_offset=own.column_offset if certainty >= SETTINGS.sure_certainty else None
+    )
 
 
 def _columns_between(own: Outline, rival: Outline, n_columns: int) -> int:

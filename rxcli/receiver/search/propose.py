@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,6 @@ from rxcli.receiver.corners import too_small
 from rxcli.receiver.light import slot_llr
 from rxcli.receiver.reception import Reception
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
-from rxcli.receiver.search.outlines import likeliest_of_family
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.unknown_camera import propose_cameras, relabelled_camera
@@ -164,6 +163,26 @@ class Proposer:
                     sampler=scored.acquisition.sampler,
                     bursts=tuple(clock.burst.tolist()),
                 )
+
+
+def likeliest_of_family(outlines: Sequence[Outline]) -> Outline:
+    """The likeliest outline of a family, under which its packets are sought.
+
+    If no numbering is likely, columns are counted from the left of the visible part.
+    """
+    odds = np.array([outline.log_odds for outline in outlines])
+    best = max(outlines, key=lambda outline: (outline.log_odds, -_left(outline)))
+    share = 1 / float(np.exp(odds - odds.max()).sum())
+    if best.fills and share < SETTINGS.likely_certainty:
+        possible = (outline for outline in outlines if outline.log_odds > best.log_odds - SETTINGS.may_be_log_odds)
+        return max(possible, key=_left)
+    return best
+
+
+def _left(outline: Outline) -> float:
+    """Position of an outline's left side along its top, for a viewer: larger is further right."""
+    along = outline.corners[1] - outline.corners[0]
+    return float(outline.corners[0] @ along / np.linalg.norm(along))
 
 
 def _is_clear(reception: Reception) -> bool:

@@ -15,12 +15,10 @@ from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
 from rxcli.receiver.corners import proposed_screens
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
-from rxcli.receiver.search.explain import why_no_packets
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
-from rxcli.receiver.search.nulls import light_without_data
-from rxcli.receiver.search.numbers import less_likely_outlines
-from rxcli.receiver.search.outlines import numbered
+from rxcli.receiver.search.numbers import less_likely_outlines, numbered
 from rxcli.receiver.search.propose import Proposer
+from rxcli.receiver.search.refusal import light_without_data, why_no_packets
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
 from rxcli.receiver.unknown_camera import settle

@@ -1,16 +1,24 @@
-"""Tests for light without data: whether a periodic waveform or a single lamp explains the light as well."""
+"""Reasons for a refusal: light without data, or nothing received.
+
+A periodic waveform or a single lamp may explain the light as well as packets do.
+"""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS
-from rxcli.receiver.acquisition import noise_of
+from rxcli.receiver.acquisition import noise_of, sample_columns
+from rxcli.receiver.camera.advice import NO_HEADERS
 from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.steady import is_common_light, periodic_share
 from rxcli.receiver.reception import Reception, contrast_of, shows_steady_light
+from rxcli.receiver.search.hypothesis import Hypothesis
+from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.settings import SETTINGS
 from rxcli.receiver.still import as_one_column
 from rxcli.receiver.sync import clock as sync
@@ -21,6 +29,7 @@ STEADY_LIGHT = (
     f"this light is switched on and off steadily (PWM), as lamps and dimmed screens do, and carries no data; {_NEXT}"
 )
 _ONE_LAMP = f"all columns show the same light and no packets in it, as of a single lamp; {_NEXT}"
+_NO_HEADER = "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
 
 
 def light_without_data(context: FrameContext, reception: Reception) -> Failure | None:
@@ -54,3 +63,25 @@ def is_switched(context: FrameContext, profiles: RowProfiles) -> bool:
         return False
     level -= level.mean(axis=1, keepdims=True)
     return periodic_share(level, 2 * SETTINGS.max_period_rows) > SETTINGS.switched_share
+
+
+def why_no_packets(proposer: Proposer, nearest: Hypothesis | None, failure: Failure | None) -> Failure:
+    """Reason why a screen gave no packets.
+
+    Args:
+        proposer: of the frame.
+        nearest: the likeliest hypothesis, or None if no camera was proposed.
+        failure: reason why there were no cameras.
+    """
+    if nearest is None:
+        return replace(failure or Failure("no_signal", NO_HEADERS), outline=proposer.families()[0])
+    context = proposer.context(nearest)
+    profiles = sample_columns(context, nearest.screen.columns).binned
+    if is_switched(context, profiles):
+        message = STEADY_LIGHT
+    elif context.camera.hypothesis is not None:
+        message = failure.message if failure else NO_HEADERS
+    else:
+        shortest = min(context.screens, key=lambda screen: screen.packet_s)
+        message = too_small(context, shortest) or _NO_HEADER
+    return Failure("no_signal", message, outline=nearest.outline, context=context)
