@@ -24,7 +24,7 @@ _BESIDE = 2
 def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Proposer) -> list[Outline]:
     """The outlines, with lower log-odds where they leave out columns with packets.
 
-    All outlines that begin further to one side leave out the columns that the nearest of them leaves out.
+    On each side the columns that the nearest outline adds are read; those beyond are taken to show as much.
 
     Args:
         best: the hypothesis that was chosen.
@@ -33,7 +33,7 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
     """
     own, n_columns = best.hypothesis.outline, best.hypothesis.screen.columns
     acquisition = replace(best.acquisition, clock=best.reception.clock)
-    out = list(outlines)
+    own_llr, out = np.maximum(best.reception.column_llr, 0.0), list(outlines)
     shifts = [_columns_between(own, rival, n_columns) if rival.family == own.family else 0 for rival in outlines]
     for side in (-1, 1):
         rivals = [index for index, shift in enumerate(shifts) if shift * side > 0]
@@ -42,9 +42,11 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
         nearest = min(rivals, key=lambda index: abs(shifts[index]))
         moved = replace(best.hypothesis, outline=outlines[nearest], camera=best.context.camera)
         sampler = sample_columns(proposer.context(moved), n_columns)
-        shift = shifts[nearest]
-        gain = _outer_evidence(replace(acquisition, sampler=sampler), -shift) - _outer_evidence(acquisition, shift)
+        added = _outer_evidence(replace(acquisition, sampler=sampler), -shifts[nearest]) / abs(shifts[nearest])
         for index in rivals:
+            shift = shifts[index]
+            left_out = own_llr[:shift] if shift > 0 else own_llr[shift:]
+            gain = added * abs(shift) - float(left_out.sum())
             log_odds = outlines[index].log_odds + SETTINGS.outer_weight * min(gain, 0.0)
             out[index] = replace(outlines[index], log_odds=log_odds)
     return out
