@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -19,35 +20,23 @@ from rxcli.types import Clock, FloatArray, IntArray, Outlines, RowProfiles
 _MAX_OUTLINES = 8
 
 
-@dataclass(frozen=True, slots=True)
-class ColumnSampler:
-    """Row profiles of a screen's columns."""
-
-    profiles: RowProfiles
-    #: The same with strips binned in pairs, for the search and an initial pass.
-    binned: RowProfiles
-
-    @classmethod
-    def of(cls, profiles: RowProfiles) -> ColumnSampler:
-        """Bin the strips of row profiles in pairs."""
-        return cls(profiles, sync.binned_strips(profiles))
-
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Acquisition:
     """A screen whose clock was found."""
 
     screen: ScreenProfile
-    sampler: ColumnSampler
+    #: Of the screen's columns.
+    profiles: RowProfiles
     clock: Clock
     #: The screen, and screens that differ from it only in the number of copies; the copies decide.
     variants: tuple[ScreenProfile, ...] = ()
     #: (n_copies,) burst of every copy; None if it is still to be estimated.
     burst: IntArray | None = None
 
-    @property
-    def profiles(self) -> RowProfiles:
-        return self.sampler.profiles
+    @cached_property
+    def binned(self) -> RowProfiles:
+        """The profiles with strips binned in pairs, for an initial pass."""
+        return sync.binned_strips(self.profiles)
 
     @property
     def repeats(self) -> tuple[int, ...]:
@@ -58,10 +47,6 @@ class Acquisition:
         """The screen that sends a packet `repeats` times."""
         return next((screen for screen in self.variants if screen.repeats == repeats), self.screen)
 
-    def binned(self) -> Acquisition:
-        """The acquisition with strips binned in pairs."""
-        return replace(self, sampler=ColumnSampler(self.sampler.binned, self.sampler.binned))
-
     @property
     def middle_columns(self) -> IntArray:
         """Numbers of the middle half of the columns."""
@@ -69,10 +54,9 @@ class Acquisition:
         return np.arange(n_columns // 4, n_columns - n_columns // 4)
 
     def of_columns(self, part: IntArray | slice) -> Acquisition:
-        """The acquisition of some columns, strips binned in pairs."""
-        chosen = self.sampler.binned.of_columns(part)
+        """The acquisition of some columns."""
         clock = replace(self.clock, delay_slots=self.clock.delay_slots[part])
-        return replace(self, sampler=ColumnSampler(chosen, chosen), clock=clock)
+        return replace(self, profiles=self.profiles.of_columns(part), clock=clock)
 
 
 def n_strips_of(corners: FloatArray, n_columns: int) -> int:
@@ -94,12 +78,12 @@ def outlines_of(context: FrameContext, n_columns: int) -> Outlines:
     return known[key]
 
 
-def sample_columns(context: FrameContext, n_columns: int) -> ColumnSampler:
+def sample_columns(context: FrameContext, n_columns: int) -> RowProfiles:
     """Sample the row profiles of a screen of `n_columns` columns in order of time."""
     frame, camera = context.frame, context.camera
     with context.timer("sampling"):
         profiles = context.timer.planes.sample(frame, outlines_of(context, n_columns), camera.tone)
-        return ColumnSampler.of(blind.in_time_order(profiles, frame.height) if camera.reversed else profiles)
+        return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
 
 
 def noise_of(profiles: RowProfiles) -> float:

@@ -72,7 +72,7 @@ def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception | 
 
 def initial_pass(acquisition: Acquisition) -> Reception:
     """Make a pass over strips binned in pairs, from an initial estimate of the slots."""
-    acquisition = acquisition.binned()
+    acquisition = replace(acquisition, profiles=acquisition.binned)
     clock = acquisition.clock
     # Demosaicing and denoising mix neighbouring rows: with few rows per slot this widens the effective exposure.
     exposure_slots = float(np.hypot(clock.exposure_slots, 1 / clock.rows_per_slot))

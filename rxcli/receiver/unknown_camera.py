@@ -28,7 +28,7 @@ def propose_cameras(
     """
     unknown = Camera(None, float("nan"), float("nan"), None, DEFAULT_TONE)
     context = FrameContext(frame, corners, unknown, options.screens, timer)
-    profiles = sample_columns(context, n_columns).profiles
+    profiles = sample_columns(context, n_columns)
     with timer("blind"):
         strips = _strips(context, profiles)
     # A picture does not show the slot rate: the fastest screen represents all with the same packet length.

@@ -19,7 +19,6 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.acquisition import (
     Acquisition,
-    ColumnSampler,
     distinct_screens,
     noise_of,
     sample_columns,
@@ -116,7 +115,7 @@ def agree(frames: Sequence[Frame], context: FrameContext) -> Start | None:
     """The clock that the headers of several frames agree on, None where they do not; `context` is of the first."""
     best: Start | None = None
     for n_columns in sorted({screen.columns for screen in context.screens}):
-        profiles_of = [sample_columns(replace(context, frame=frame), n_columns).profiles for frame in frames]
+        profiles_of = [sample_columns(replace(context, frame=frame), n_columns) for frame in frames]
         for screen in (s for s in distinct_screens(context.screens) if s.columns == n_columns):
             lead, slot, period = _phase(frames, profiles_of, screen, context.camera)
             if lead > SETTINGS.min_lead and (best is None or lead > best.lead):
@@ -129,7 +128,7 @@ def agree(frames: Sequence[Frame], context: FrameContext) -> Start | None:
 def acquisition_at(start: Start, context: FrameContext) -> Acquisition | None:
     """What the clip's clock predicts for a frame; None where nothing of the screen is in the picture."""
     screen, frame, camera = start.screen, context.frame, context.camera
-    profiles = sample_columns(context, screen.columns).profiles
+    profiles = sample_columns(context, screen.columns)
     rows = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
     if rows.size == 0:
         return None
@@ -148,7 +147,7 @@ def acquisition_at(start: Start, context: FrameContext) -> Acquisition | None:
     n_slots = int(np.ceil((rows[-1] - rows[0] + 1) / rows_per_slot)) + 1
     top = float(profiles.rows[rows[0]]) - 0.5
     clock = start.time.clock_at(frame.index, frame.time_s, template, n_slots, top)
-    return None if clock is None else Acquisition(screen, ColumnSampler.of(profiles), clock, variants=start.variants)
+    return None if clock is None else Acquisition(screen, profiles, clock, variants=start.variants)
 
 
 def _phase(

@@ -348,7 +348,7 @@ class Ledger:
             self._last_closed = max(self._last_closed, burst.number)
             del self._bursts[burst.number]
             waiting.skip("dark_columns", int((~burst.tried).sum()))
-        n_strips = view.acquisition.sampler.binned.light.shape[1]
+        n_strips = view.acquisition.binned.light.shape[1]
         ended = [burst.ended(int(waiting.numbers[0]), n_strips) for burst in closed]
         headerless = np.zeros(len(view.snr), bool)
         if self._link is not None:

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.acquisition import Acquisition, ColumnSampler
+from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.context import Camera, FrameContext, Outline
 from rxcli.receiver.reception import Reception
-from rxcli.types import Clock, SearchStep
+from rxcli.types import Clock, RowProfiles, SearchStep
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Hypothesis:
     clock: Clock | None = None
     #: Burst of every copy; None: from the similarity of copies.
     bursts: tuple[int, ...] | None = None
-    sampler: ColumnSampler | None = field(default=None, repr=False, compare=False)
+    profiles: RowProfiles | None = field(default=None, repr=False, compare=False)
 
     @property
     def identity(self) -> tuple[object, ...]:

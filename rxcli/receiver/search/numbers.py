@@ -41,8 +41,8 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
             continue
         nearest = min(rivals, key=lambda index: abs(shifts[index]))
         moved = replace(best.hypothesis, outline=outlines[nearest], camera=best.context.camera)
-        sampler = sample_columns(proposer.context(moved), n_columns)
-        added = _outer_evidence(replace(acquisition, sampler=sampler), -shifts[nearest]) / abs(shifts[nearest])
+        profiles = sample_columns(proposer.context(moved), n_columns)
+        added = _outer_evidence(replace(acquisition, profiles=profiles), -shifts[nearest]) / abs(shifts[nearest])
         for index in rivals:
             shift = shifts[index]
             left_out = own_llr[:shift] if shift > 0 else own_llr[shift:]

@@ -9,7 +9,7 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.acquisition import ColumnSampler, noise_of, sample_columns, variants_of
+from rxcli.receiver.acquisition import noise_of, sample_columns, variants_of
 from rxcli.receiver.cameras import known_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
 from rxcli.receiver.corners import too_small
@@ -19,7 +19,7 @@ from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.unknown_camera import propose_cameras, relabelled_camera
-from rxcli.types import Clock, Frame
+from rxcli.types import Clock, Frame, RowProfiles
 
 #: Number of columns on which a clock is sought first, or the nearest available number.
 _USUAL_COLUMNS = 20
@@ -112,20 +112,20 @@ class Proposer:
 
     def with_clock(self, hypothesis: Hypothesis) -> Hypothesis | None:
         """The hypothesis with its columns and its clock, or None if no header is found."""
-        sampler = sample_columns(self.context(hypothesis), hypothesis.screen.columns)
+        profiles = sample_columns(self.context(hypothesis), hypothesis.screen.columns)
         with self.timer("clock"):
-            clock = _clock(hypothesis, sampler)
+            clock = _clock(hypothesis, profiles)
         if clock is None or clock.header_peak_ratio < SETTINGS.min_lead:
             return None
         lead = np.log(clock.header_peak_ratio / SETTINGS.clear_lead)
         log_prior = hypothesis.log_prior + SETTINGS.lead_weight * min(float(lead), 0.0)
         has_same_copies = hypothesis.bursts is not None and len(hypothesis.bursts) == clock.n_copies
         bursts = hypothesis.bursts if has_same_copies else None
-        return replace(hypothesis, clock=clock, sampler=sampler, bursts=bursts, log_prior=log_prior)
+        return replace(hypothesis, clock=clock, profiles=profiles, bursts=bursts, log_prior=log_prior)
 
     def siblings(self, scored: Scored) -> Iterator[Hypothesis]:
         """Hypotheses that differ from a scored one in one respect, with their changed log prior."""
-        hypothesis = replace(scored.hypothesis, camera=scored.context.camera, clock=None, sampler=None, bursts=None)
+        hypothesis = replace(scored.hypothesis, camera=scored.context.camera, clock=None, profiles=None, bursts=None)
         outline, camera, log_prior = hypothesis.outline, hypothesis.camera, hypothesis.log_prior
         clock, n_columns = _clock_of(hypothesis.screen, camera), hypothesis.screen.columns
         for candidate in self.families():
@@ -160,7 +160,7 @@ class Proposer:
                     scored.hypothesis,
                     camera=scored.context.camera,
                     clock=scored.acquisition.clock,
-                    sampler=scored.acquisition.sampler,
+                    profiles=scored.acquisition.profiles,
                     bursts=tuple(clock.burst.tolist()),
                 )
 
@@ -214,9 +214,9 @@ def _by_clock(
     return {clock: groups[clock] for clock in sorted(groups) if groups[clock]}
 
 
-def _clock(hypothesis: Hypothesis, sampler: ColumnSampler) -> Clock | None:
+def _clock(hypothesis: Hypothesis, profiles: RowProfiles) -> Clock | None:
     screen, camera = hypothesis.screen, hypothesis.camera
-    pooled = sync.pooled_strips(sampler.binned)
+    pooled = sync.pooled_strips(sync.binned_strips(profiles))
     rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
     exposure_slots = camera.exposure_s * screen.slot_rate_hz
     return sync.find_clock(pooled, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(pooled))

@@ -76,7 +76,7 @@ def why_no_packets(proposer: Proposer, nearest: Hypothesis | None, failure: Fail
     if nearest is None:
         return replace(failure or Failure("no_signal", NO_HEADERS), outline=proposer.families()[0])
     context = proposer.context(nearest)
-    profiles = sample_columns(context, nearest.screen.columns).binned
+    profiles = sync.binned_strips(sample_columns(context, nearest.screen.columns))
     if is_switched(context, profiles):
         message = STEADY_LIGHT
     elif context.camera.hypothesis is not None:

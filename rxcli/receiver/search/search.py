@@ -225,7 +225,7 @@ class _Walk:
 
 
 def _acquired(hypothesis: Hypothesis) -> Acquisition:
-    assert hypothesis.sampler is not None
+    assert hypothesis.profiles is not None
     assert hypothesis.clock is not None
     bursts = None if hypothesis.bursts is None else np.array(hypothesis.bursts)
-    return Acquisition(hypothesis.screen, hypothesis.sampler, hypothesis.clock, hypothesis.variants, bursts)
+    return Acquisition(hypothesis.screen, hypothesis.profiles, hypothesis.clock, hypothesis.variants, bursts)
