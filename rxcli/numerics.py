@@ -15,6 +15,8 @@ from rxcli.types import Float32Array, FloatArray
 
 #: Lower limit of divisors, far below any significant light, weight or variance.
 TINY = 1e-12
+#: Median of the absolute value of a normal variable of unit variance.
+NORMAL_MEDIAN = 0.6745
 #: Change of a header's slots, lit 1 and dark -1, at its borders.
 _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
 

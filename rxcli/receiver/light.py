@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import TINY
 from rxcli.protocol import HEADER, slot_patterns
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -27,8 +28,8 @@ MAX_MEMORY = 5
 #: The dark slots in the middle of a header.
 _DARK_FROM = HEADER.index(0, HEADER.index(1))
 _DARK_TO = HEADER.index(1, _DARK_FROM)
-#: Shortest exposure and blur, slots.
-_MIN_SLOTS = 1e-3
+#: Shortest exposure, slots, and narrowest spread of light, column pitches.
+_MIN_WIDTH = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,7 @@ class Exposure:
         centres = -isi_memory / 2 + (np.arange(q) + 0.5) / q
         fine = (centres[:, None] + offsets)[:, None, :]
         slots = np.arange(-isi_memory, 1)[:, None]
-        return Exposure(exposure_shares(fine, slots, max(exposure_slots, _MIN_SLOTS)).mean(axis=2))
+        return Exposure(exposure_shares(fine, slots, max(exposure_slots, _MIN_WIDTH)).mean(axis=2))
 
     @property
     def isi_memory(self) -> int:
@@ -151,7 +152,7 @@ def column_light(n_strips: int, n_columns: int, light_spread: float) -> FloatArr
     """
     place = (np.arange(n_strips) + 0.5) / n_strips * n_columns
     square = (place[:, None] - np.arange(n_columns) - 0.5) ** 2
-    return np.asarray(np.exp((square.min(axis=1, keepdims=True) - square) / (2 * max(light_spread, 1e-3) ** 2)))
+    return np.asarray(np.exp((square.min(axis=1, keepdims=True) - square) / (2 * max(light_spread, _MIN_WIDTH) ** 2)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,7 +171,7 @@ class Crosstalk:
         fine = 16
         across = (np.arange(n_strips * fine) + 0.5) / (n_strips * fine) - 0.5
         distance = across[:, None] - np.arange(-1, 2)
-        exponent = (-(distance**2) / (2 * max(light_spread, 1e-3) ** 2)).reshape(n_strips, -1, 3)
+        exponent = (-(distance**2) / (2 * max(light_spread, _MIN_WIDTH) ** 2)).reshape(n_strips, -1, 3)
         # A strip receives the mean over its width: a strip of a whole column has twice the crosstalk of its centre.
         weight = np.exp(exponent - exponent.max(axis=(1, 2), keepdims=True)).mean(axis=1)
         return Crosstalk(np.asarray(weight / weight.sum(axis=1, keepdims=True)))
@@ -207,8 +208,8 @@ class Crosstalk:
         The shares of a Gaussian determine the position of a strip x: the second difference of their logarithms is
         1 / sigma**2, the first is x / sigma**2.
         """
-        log = np.log(np.maximum(self.shares, 1e-12))
-        curvature = np.maximum(2 * log[:, 1] - log[:, 0] - log[:, 2], 1e-6)
+        log = np.log(np.maximum(self.shares, TINY))
+        curvature = np.maximum(2 * log[:, 1] - log[:, 0] - log[:, 2], TINY)
         slope = (log[:, 2] - log[:, 0]) / 2
         return np.asarray(np.exp(-np.square(slope) / (2 * curvature)), np.float32)[None, :, None]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.numerics import TINY, folded, header_correlation, local_mean
+from rxcli.numerics import NORMAL_MEDIAN, TINY, folded, header_correlation, local_mean
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.curvature import likeliest_bend, straightened
@@ -186,7 +186,7 @@ def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:
     scaled = correlation / np.sqrt(np.arange(n, 0, -1))
     part = scaled[min(shortest, n // 2) : max(n - SLOTS_PER_SYMBOL, n // 2 + 1)]
     middle = float(np.median(part))
-    out = np.maximum(scaled - middle, 0) / (1.4826 * float(np.median(np.abs(part - middle))) + 1e-9)
+    out = np.maximum(scaled - middle, 0) / (float(np.median(np.abs(part - middle))) / NORMAL_MEDIAN + TINY)
     # Hardly any row overlaps there.
     out[-SLOTS_PER_SYMBOL:] = 0
     return np.asarray(out)
@@ -226,7 +226,7 @@ def _header_peaks(total: FloatArray, rows_per_slot: float, packet_slots: int) ->
     response = header_correlation(np.interp(places, np.arange(total.size), total), _SAMPLES) / step
     if response.size == 0:
         return 0.0, 0.0
-    spread = 1.4826 * float(np.median(np.abs(response))) + 1e-6
+    spread = float(np.median(np.abs(response))) / NORMAL_MEDIAN + 1e-6
     period = packet_slots * _SAMPLES
     n_copies = folded(np.ones(response.size), period)
     score = folded(response, period) / np.sqrt(np.maximum(n_copies, 1)) / spread

@@ -25,7 +25,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from rxcli.errors import ProfileError
-from rxcli.numerics import box_sums
+from rxcli.numerics import NORMAL_MEDIAN, box_sums
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
@@ -46,6 +46,8 @@ COLUMN_FEATURES = ("known", "phase[10]", "believed", "lent", "weight", "score", 
 N_STRIP_FEATURES, N_COLUMN_FEATURES = 26, 16
 #: Limit of residuals in features, standard deviations; the network was trained with it.
 _RESIDUAL_SIGMAS = 4.0
+#: Least distance of a slot's probability from 0 and 1 in features.
+_MIN_DOUBT = 1e-5
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +149,7 @@ def _row_light(residual: Float32Array, scale: Float32Array) -> Float32Array:
     mean = (total.sum(axis=0) - total) / weight
     # Errors of the strips of a column are correlated, which about doubles the variance of their mean.
     error = 2 / weight
-    power = max(float(np.median(mean * mean)) / 0.455 - float(np.median(error)), 0.0)
+    power = max(float(np.median(mean * mean)) / NORMAL_MEDIAN**2 - float(np.median(error)), 0.0)
     return np.asarray(mean * np.float32(power) / (np.float32(power) + error + np.float32(1e-20)), np.float32)
 
 
@@ -186,15 +188,14 @@ def _strip_features(scene: DenoiserInput, observed: _Residuals, columns: NDArray
 def _column_features(scene: DenoiserInput, observed: _Residuals, columns: NDArray[np.int64]) -> Float32Array:
     """(B, 16, N) features of columns, see `COLUMN_FEATURES`."""
     q, clock = scene.samples.samples_per_slot, scene.clock
-    lit = np.clip(scene.lit[columns], 1e-5, 1 - 1e-5)
+    lit = np.clip(scene.lit[columns], _MIN_DOUBT, 1 - _MIN_DOUBT)
     llr = slot_llr(scene.metrics[columns], lit)
     contrast = _contrast_feature(observed.contrast)
     place = clock.places % SLOTS_PER_SYMBOL
     by_slot = (
         _known_slots(clock),
         *(np.arange(SLOTS_PER_SYMBOL)[:, None] == place),
-        np.clip(llr / 4, -3, 3),
-        np.clip((np.log(lit / (1 - lit)) - llr) / 4, -3, 3),
+        *(np.clip(values / 4, -3, 3) for values in (llr, np.log(lit / (1 - lit)) - llr)),
         scene.w[columns, None] / SLOTS_PER_SYMBOL,
         np.clip(
             _pooled(_bounded(np.clip(observed.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS)) * contrast, q), -4, 4
@@ -206,7 +207,7 @@ def _column_features(scene: DenoiserInput, observed: _Residuals, columns: NDArra
 
 
 def _contrast_feature(contrast: Float32Array) -> Float32Array:
-    return np.asarray(np.minimum(contrast, np.float32(2 * _RESIDUAL_SIGMAS)) / np.float32(4))
+    return np.asarray(np.minimum(contrast, np.float32(2 * _RESIDUAL_SIGMAS)) / np.float32(_RESIDUAL_SIGMAS))
 
 
 def _bounded(residual: Float32Array) -> Float32Array:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import NORMAL_MEDIAN
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, sees_dark_header
 from rxcli.types import Clock, Float32Array, SlotSamples
@@ -87,4 +88,4 @@ def estimate_sigma(samples: SlotSamples, black_level: float, min_sigma: float) -
     second_difference = (light[..., 2:] - 2 * light[..., 1:-1] + light[..., :-2])[dark]
     if second_difference.size < 50:
         return min_sigma
-    return max(float(np.median(np.abs(second_difference)) / (0.6745 * np.sqrt(6.0))), min_sigma)
+    return max(float(np.median(np.abs(second_difference)) / (NORMAL_MEDIAN * np.sqrt(6.0))), min_sigma)

@@ -66,7 +66,7 @@ class _LevelPlan:
     shares: Float32Array
 
 
-@lru_cache(maxsize=32)
+@lru_cache
 def _level_plan(taps: bytes, samples_per_slot: int) -> _LevelPlan:
     q = samples_per_slot
     weights = np.frombuffer(taps).reshape(q, -1)
