@@ -17,8 +17,8 @@ from rxcli.receiver.screen.find import (
     BRIGHTEN,
     ColumnLayout,
     OutlineCandidate,
-    find_outlines,
     find_screens,
+    shows_columns_plainly,
     thinned,
     why_useless,
 )
@@ -163,7 +163,7 @@ def whole_picture(frame: Frame) -> FloatArray:
 def turned_pixels(frame: Frame, options: ReceiverOptions, timer: Timer) -> str | None:
     """Message about a picture that was rotated by 90 degrees, or None. Of a clip only the first frame is examined."""
     wide = [layout for layout in layouts_of(options) if not layout.is_narrow]
-    if frame.index or not find_outlines(turned(timer.planes.plane(frame)), wide):
+    if frame.index or not wide or not shows_columns_plainly(turned(timer.planes.plane(frame)), wide[0].sigma):
         return None
     return (
         "the picture was turned by 90 degrees after it was taken, or taken in portrait: its stripes run downwards; use "

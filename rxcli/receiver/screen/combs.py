@@ -57,27 +57,22 @@ def likeness(sigma: float, distance: float) -> tuple[float, float]:
     return float(cosine.mean()), float(2 * (cosine * np.cos(2 * np.pi * middle)).mean())
 
 
-def find_combs(strips: Strips, sigma: float) -> list[Comb]:
-    """The strongest combs, strongest first: several if the picture is one part, else the strongest of each part.
+def find_combs(strips: Strips, sigma: float, part: int = 0) -> list[Comb]:
+    """The strongest combs in one part of the picture, strongest first.
 
     Args:
         strips: of the picture.
         sigma: light spread of the screen, column pitches.
+        part: number of the part, from the left.
     """
-    n_windows, n_parts = strips.n_windows, strips.n_parts
-    found: list[Comb] = []
-    for part in range(n_parts):
-        own = strips.blocks(slice(part * n_windows, (part + 1) * n_windows))
-        combs = sorted(_combs_of_part(own, sigma, part), key=lambda comb: -comb.score)
-        found += _distinct(combs, SETTINGS.n_combs if n_parts == 1 else 1)
-    return sorted(found, key=lambda comb: -comb.score)
+    own = strips.part(part)
+    return _distinct(sorted(_combs_of_part(own, sigma, part), key=lambda comb: -comb.score), SETTINGS.n_combs)
 
 
 def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
     """The grid of the whole picture that is nearest to a comb in its part."""
-    n = strips.n_windows
-    own = slice(comb.part * n, (comb.part + 1) * n)
-    raw_x, raw_y, x, y = (values[own].ravel() for values in (strips.raw_x, strips.raw_y, strips.x, strips.y))
+    own = strips.part(comb.part)
+    raw_x, raw_y, x, y = (values.ravel() for values in (own.raw_x, own.raw_y, own.x, own.y))
     local_x, local_y = (raw_x - raw_x.mean()) * strips.n_parts, raw_y * strips.n_parts
     bent = local_x + comb.turn * local_y + comb.across * local_x**2 + comb.along * local_x * local_y
     pitch = comb.pitch * strips.n_parts
@@ -137,19 +132,17 @@ def _best_combs(
     n_frequencies = int(np.ceil((largest + reach) / spacing)) - start + 1
     own = pitches[:, None, None] * (1 + along[:, None] * y)
     nearest = np.round(own / spacing).astype(np.int64) - start
-    wave = _waves(rest.shape[1], step, start, n_frequencies)
     x = (np.arange(rest.shape[1]) - (rest.shape[1] - 1) / 2) * step
+    bent = rest * _turned(float(pitches.mean()) * np.multiply.outer(across, x * x))[:, None]
+    along_strips = np.matmul(bent, _waves(rest.shape[1], step, start, n_frequencies))
     over_windows = _turned(pitches[:, None, None] * np.multiply.outer(y, turns))
-    sums = np.empty((pitches.size, across.size, along.size, turns.size), np.complex64)
-    for number, quadratic in enumerate((float(pitches.mean()) * across).tolist()):
-        along_strips = (rest * _turned(quadratic * x * x)) @ wave
-        sums[:, number] = np.matmul(along_strips[np.arange(y.size), nearest], over_windows)
-    heights, out = np.abs(sums), []
+    sums = np.matmul(along_strips[:, np.arange(y.size), nearest], over_windows).swapaxes(0, 1)
+    power, out = np.square(sums.real) + np.square(sums.imag), []
     for number, pitch in enumerate(pitches.tolist()):
-        i, j, k = np.unravel_index(int(heights[number].argmax()), heights[number].shape)
+        i, j, k = np.unravel_index(int(power[number].argmax()), power[number].shape)
         phase = -float(np.angle(sums[number, i, j, k])) / (2 * np.pi)
         shape = float(turns[k]), float(across[i]), float(along[j])
-        out.append(Comb(float(heights[number, i, j, k]), pitch, *shape, phase, part))
+        out.append(Comb(float(np.sqrt(power[number, i, j, k])), pitch, *shape, phase, part))
     return out
 
 
@@ -161,5 +154,9 @@ def _waves(n: int, step: float, start: int, n_frequencies: int) -> NDArray[np.co
 
 
 def _turned(turns: FloatArray) -> NDArray[np.complex64]:
-    wave: NDArray[np.complex64] = np.exp((2j * np.pi) * turns).astype(np.complex64)
+    """exp(2 pi i `turns`), in single precision after whole turns are taken off."""
+    angle = np.asarray((turns - np.rint(turns)) * (2 * np.pi), np.float32)
+    wave = np.empty(angle.shape, np.complex64)
+    np.cos(angle, out=wave.real)
+    np.sin(angle, out=wave.imag)
     return wave

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import Comb, find_combs, grid_of_comb
-from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_through
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.settings import SETTINGS
@@ -167,19 +167,24 @@ def follow_outline(plane: LightPlane, corners: FloatArray, layout: ColumnLayout)
 
 def wide_grid(strips: Strips, sigma: float) -> Grid | None:
     """The grid of wide columns that explains the strips' light best, or None."""
-    some, few = (strips.blocks(slice(None, None, step)) for step in (2, 4))
-    combs = _possible_combs(strips, sigma)
+    some, combs = strips.blocks(slice(None, None, 2)), _possible_combs(strips, sigma)
     if not combs:
         return None
     best = with_light(some, grid_of_comb(combs[0], strips), sigma)
-    is_plain = best.contrast > SETTINGS.plain_contrast * best.explained
-    if not is_plain:
-        rest = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
-        best = max([best, *rest], key=_score)
+    if best.is_plain:
+        return moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)
+    best = max((with_light(strips, grid_of_comb(comb, strips), sigma) for comb in combs), key=_score)
     best = moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)
-    starts = [best] if is_plain else [best, slipped_grid(few, best, sigma)]
-    settled = [grid for start in starts if (grid := _settled(strips, start, sigma)) is not None]
-    return max(settled, key=_score, default=None)
+    best = with_light(strips, moved_by_waveforms(strips, best, sigma, SETTINGS.last_steps), sigma)
+    return best if _stands_out(strips, best) else None
+
+
+def shows_columns_plainly(plane: LightPlane, sigma: float) -> bool:
+    """Whether a picture shows wide columns beyond doubt."""
+    strips = read_strips(plane)
+    combs = _possible_combs(strips, sigma)
+    few = strips.blocks(slice(None, None, 4))
+    return bool(combs) and with_light(few, grid_of_comb(combs[0], strips), sigma).is_plain
 
 
 def _score(grid: Grid) -> float:
@@ -187,39 +192,23 @@ def _score(grid: Grid) -> float:
     return grid.explained + SETTINGS.contrast_weight * grid.contrast
 
 
-def slipped_grid(strips: Strips, grid: Grid, sigma: float) -> Grid:
-    """The best grid that differs from the given one by a column at the left or at the right.
-
-    Where light is faint at an end, the columns there may be counted wrong.
-    """
-    x, y = strips.x.ravel(), strips.y.ravel()
-    u = columns_at(grid.numbers, x, y)
-    grids = []
-    for end_weight in (np.square(strips.raw_x.ravel() + 0.5), np.square(strips.raw_x.ravel() - 0.5)):
-        for shift in (-end_weight, end_weight):
-            moved = moved_by_waveforms(strips, grid_through(grid, x, y, u + shift), sigma, SETTINGS.slip_steps)
-            grids.append(with_light(strips, moved, sigma))
-    return max(grids, key=_score)
-
-
 def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
     """The grid of narrow columns, or None.
 
-    Each part of the picture gives a grid. The one with the clearest borders is followed over the whole width.
+    The parts of the picture are searched, from the middle on. A clear grid is followed over the whole width.
     """
-    some = strips.blocks(slice(None, None, 2))
-    n = some.n_windows
-    best: tuple[float, Grid, float] | None = None
-    for comb in _possible_combs(strips, sigma):
-        part = some.blocks(slice(comb.part * n, (comb.part + 1) * n))
-        grid = moved_by_waveforms(part, grid_of_comb(comb, strips), sigma, SETTINGS.narrow_steps)
-        if abs(grid.pitch_px - _BLOCK_PX) < _BLOCK_TOLERANCE_PX:
-            continue
-        grid = with_light(part, grid, sigma)
-        clearness = grid.contrast / max(grid.explained, 1.0)
-        if clearness > (best[0] if best else SETTINGS.min_part_contrast):
-            best = clearness, grid, float(part.raw_x.mean())
-    return None if best is None else _settled(strips, _followed(some, *best[1:], sigma), sigma)
+    some, few = (strips.blocks(slice(None, None, step)) for step in (2, 4))
+    for part in sorted(range(strips.n_parts), key=lambda part: abs(part - strips.n_parts // 2)):
+        for comb in _possible_combs(strips, sigma, part)[:1]:
+            own = few.part(part)
+            grid = moved_by_waveforms(own, grid_of_comb(comb, strips), sigma, SETTINGS.narrow_steps)
+            is_block = abs(grid.pitch_px - _BLOCK_PX) < _BLOCK_TOLERANCE_PX
+            if is_block or not _stands_out(own, with_light(own, grid, sigma), SETTINGS.min_narrow_contrast):
+                continue
+            grid = with_light(some, _followed(some, grid, float(own.raw_x.mean()), sigma), sigma)
+            if _stands_out(some, grid, SETTINGS.min_narrow_contrast):
+                return grid
+    return None
 
 
 def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
@@ -229,25 +218,20 @@ def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
         reach *= SETTINGS.reach_gain
         within = np.abs(strips.raw_x - middle) < reach
         near = np.flatnonzero(within.any(axis=1))
-        grid = moved_by_waveforms(strips.blocks(near), grid, sigma, SETTINGS.narrow_steps, within[near])
+        grid = moved_by_waveforms(strips.blocks(near), grid, sigma, SETTINGS.first_steps, within[near])
     return grid
 
 
-def _possible_combs(strips: Strips, sigma: float) -> list[Comb]:
+def _possible_combs(strips: Strips, sigma: float, part: int = 0) -> list[Comb]:
     """The combs to fit grids to; none if the best may be chance."""
-    combs = find_combs(strips, sigma)
+    combs = find_combs(strips, sigma, part)
     return combs if combs and combs[0].score > SETTINGS.min_comb else []
 
 
-def _settled(strips: Strips, grid: Grid, sigma: float) -> Grid | None:
-    """A grid after its last steps, or None if borders half a column further on explain nearly as much."""
-    grid = with_light(strips, moved_by_waveforms(strips, grid, sigma, SETTINGS.last_steps), sigma)
-    return grid if _stands_out(strips, grid) else None
-
-
-def _stands_out(strips: Strips, grid: Grid) -> bool:
-    by_chance = SETTINGS.min_contrast * grid.explained / np.sqrt(strips.n_rows * SETTINGS.n_windows)
-    return bool(grid.contrast > by_chance)
+def _stands_out(strips: Strips, grid: Grid, min_contrast: float = SETTINGS.min_contrast) -> bool:
+    """Whether borders half a column further on explain less, by more than chance."""
+    by_chance = grid.explained / np.sqrt(strips.n_rows * SETTINGS.n_windows)
+    return bool(grid.contrast > min_contrast * by_chance)
 
 
 def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> list[OutlineCandidate]:
@@ -261,11 +245,9 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> li
     for layout, start in zip(layouts, starts, strict=True):
         likely = np.flatnonzero(start.log_odds > start.log_odds.max() + SETTINGS.min_log_odds)
         best = int(start.columns[start.log_odds.argmax()])
-        own = grid.shifted(best)
-        if is_plain:
-            # Light beyond the first and last column does not come from the screen.
-            n_steps = SETTINGS.last_steps
-            own = moved_by_waveforms(strips, own, layout.sigma, n_steps, n_columns=layout.n_columns)
+        # Where the first column is plain, light beyond the screen's ends does not come from it.
+        n_columns = layout.n_columns if is_plain else None
+        own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, SETTINGS.last_steps, n_columns=n_columns)
         plane, ends = find_rows(strips, light, own, layout.n_columns, layout.aspect)
         for number, log_odds in zip(start.columns[likely].tolist(), start.log_odds[likely].tolist(), strict=True):
             corners = tuple(plane.corners(extent, number - best) for extent in ends)

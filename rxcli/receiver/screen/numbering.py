@@ -130,46 +130,44 @@ def first_columns(light: LightProfile, n_columns: int) -> FirstColumns:
     """
     shown = light.place[light.in_picture]
     left, right = float(shown.min()), float(shown.max())
-    candidates = np.arange(int(left) - n_columns + 3, int(right) - 2)
+    starts = np.arange(int(left) - n_columns + 3, int(right) - 2)
+    ends, middles = starts + n_columns, starts + n_columns / 2
     begin, end_of_light = light.ends
-    reaches = (begin < left + _IN_VIEW, end_of_light > right - _IN_VIEW)
-    film = _FILM + float(np.log(n_columns / _USUAL_COLUMNS)) if _is_film(light, n_columns) else 0.0
-    scores = []
-    for start in candidates.tolist():
-        end = start + n_columns
-        hidden = max(left - start, 0.0), max(end - right, 0.0)
-        off = (begin + end_of_light) / 2 - start - n_columns / 2
-        score = _light_within(light, start, end) + _hidden(hidden, reaches) - 0.5 * (off / (_LIGHT_SD * n_columns)) ** 2
-        if light.film is not None:
-            score += film * (abs(sum(light.film) / 2 - start - n_columns / 2) < _IN_MIDDLE)
-        score += _ON_BORDER * (_begins(light, start, 1) + _begins(light, end, -1))
-        scores.append(score)
-    return FirstColumns(candidates, np.array(scores), all(reaches))
+    reaches = np.array([begin < left + _IN_VIEW, end_of_light > right - _IN_VIEW])
+    off = (begin + end_of_light) / 2 - middles
+    odds = _light_within(light, starts, ends) - 0.5 * np.square(off / (_LIGHT_SD * n_columns))
+    odds += _hidden(np.maximum(np.stack([left - starts, ends - right]), 0.0), reaches)
+    odds += _ON_BORDER * (_begins(light, starts, 1) + 1.0 * _begins(light, ends, -1))
+    if light.film is not None and _is_film(light.film, n_columns):
+        more = float(np.log(n_columns / _USUAL_COLUMNS))
+        odds += (_FILM + more) * (np.abs(sum(light.film) / 2 - middles) < _IN_MIDDLE)
+    return FirstColumns(starts, odds, bool(reaches.all()))
 
 
-def _is_film(light: LightProfile, n_columns: int) -> bool:
-    film = light.film
-    return film is not None and _MIN_FILM * n_columns < film[1] - film[0] < n_columns - _BARS
+def _is_film(film: tuple[float, float], n_columns: int) -> bool:
+    return _MIN_FILM * n_columns < film[1] - film[0] < n_columns - _BARS
 
 
-def _hidden(columns: tuple[float, float], reaches: tuple[bool, bool]) -> float:
-    """Log-odds of columns left and right of the picture, given whether light reaches each end of the picture."""
-    if all(reaches):
-        return max(_OUTSIDE * sum(columns), _LARGER)
-    odds = [_OUTSIDE * count for count in columns]
-    return sum(max(side, _LARGER) if to_the_end else side for side, to_the_end in zip(odds, reaches, strict=True))
+def _hidden(columns: FloatArray, reaches: BoolArray) -> FloatArray:
+    """Log-odds (F,) of columns (2, F) left and right of the picture, given whether light reaches its two ends."""
+    odds = _OUTSIDE * columns
+    if reaches.all():
+        return np.asarray(np.maximum(odds.sum(axis=0), _LARGER))
+    return np.asarray(np.where(reaches[:, None], np.maximum(odds, _LARGER), odds).sum(axis=0))
 
 
-def _begins(light: LightProfile, border: int, side: int) -> bool:
-    """Whether light begins on a border, to its right (1) or left (-1)."""
-    off = side * (light.place - border)
+def _begins(light: LightProfile, borders: IntArray, side: int) -> BoolArray:
+    """(F,) whether light begins on each border, to its right (1) or left (-1)."""
+    off = side * (light.place - borders[:, None])
     beyond = (off < -1 / _PARTS) & (off > -0.5)
-    inside, outside = light.log_odds[(off > 1 / _PARTS) & (off < 0.5)].sum(), light.log_odds[beyond].sum()
-    return bool(light.in_picture[beyond].all() and inside > _BEGINS_ODDS and outside < _BEYOND * inside)
+    inside, outside = ((off > 1 / _PARTS) & (off < 0.5)) @ light.log_odds, beyond @ light.log_odds
+    is_shown = (light.in_picture | ~beyond).all(axis=1)
+    return np.asarray(is_shown & (inside > _BEGINS_ODDS) & (outside < _BEYOND * inside))
 
 
-def _light_within(light: LightProfile, start: int, end: int) -> float:
-    """Log-odds that the screen lies between two borders; parts next to a border count only if they have light."""
-    near = np.minimum(np.abs(light.place - start), np.abs(light.place - end)) < 1 / _PARTS
-    inside = (light.place > start) & (light.place < end) & ~near
-    return float(light.log_odds[inside].sum() + np.maximum(light.log_odds[near], 0.0).sum())
+def _light_within(light: LightProfile, starts: IntArray, ends: IntArray) -> FloatArray:
+    """(F,) log-odds that the screen lies between two borders; parts next to a border count only if they have light."""
+    start, end = (light.place - borders[:, None] for borders in (starts, ends))
+    near = np.minimum(np.abs(start), np.abs(end)) < 1 / _PARTS
+    inside = (start > 0) & (end < 0) & ~near
+    return np.asarray(inside @ light.log_odds + near @ np.maximum(light.log_odds, 0.0))

@@ -17,7 +17,7 @@ from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_slopes
 from rxcli.receiver.screen.rows import Plane
 from rxcli.receiver.screen.settings import SETTINGS
-from rxcli.receiver.screen.strips import Strips
+from rxcli.receiver.screen.strips import LONG_ROWS, Strips
 from rxcli.receiver.screen.waveforms import Mixes, offsets_of_known
 from rxcli.types import Clock, Float32Array, FloatArray, Lens
 
@@ -83,7 +83,7 @@ def _waves(
     places = np.stack([strips.raw_x, strips.raw_y], axis=-1) * strips.width
     places += (np.array([strips.width, strips.height]) - 1) / 2
     sensor_row = (places if lens is None or not lens.corrected else geometry.distort(places, lens))[..., 1]
-    rows = (np.arange(n_windows * n_rows) * strips.short_rows).reshape(n_windows, n_rows)
+    rows = ((np.arange(n_windows * n_rows) + 0.5) * strips.short_rows - 0.5).reshape(n_windows, n_rows)
     windows = np.tile(np.arange(n_windows), strips.n_parts)[:, None]
     inside = (column > 0) & (column < n_columns)
     cell = (np.clip(column, 0, n_columns - 1).astype(np.int64) * n_windows + windows)[inside]
@@ -92,14 +92,13 @@ def _waves(
     at = (rows + off.reshape(n_columns, n_windows, 1)).reshape(n_columns, -1)
     light = SlotLight(lit)
 
-    def mean(n: int) -> Float32Array:
-        """Light over `n` rows; an even number of rows is centred half a row higher."""
-        middle = at - 0.5 * (n % 2 == 0)
-        row = strips.height - 1 - middle if is_reversed else middle
-        slot = (row - clock.row0) / clock.rows_per_slot - clock.delay_slots[:, None]
-        return light.mean_over(slot, float(np.hypot(clock.exposure_slots, n / clock.rows_per_slot)))
+    row = strips.height - 1 - at if is_reversed else at
+    slot = (row - clock.row0) / clock.rows_per_slot - clock.delay_slots[:, None]
 
-    changes = mean(strips.short_rows) - mean(8 * strips.short_rows)
+    def mean(n_rows: int) -> Float32Array:
+        return light.mean_over(slot, float(np.hypot(clock.exposure_slots, n_rows / clock.rows_per_slot)))
+
+    changes = mean(strips.short_rows) - mean(LONG_ROWS * strips.short_rows)
     changes = changes.reshape(n_columns, n_windows, n_rows).transpose(1, 0, 2)
     noise = strips.row_noise / (np.linalg.norm(strips.row_noise, axis=1, keepdims=True) + np.float32(TINY))
     # The row noise is projected off the strips, so it is projected off the waves.

@@ -143,6 +143,10 @@ def _light_along(strips: Strips, light: Float32Array, plane: Plane) -> tuple[Flo
     # A strip's rows of one window lie evenly along the screen.
     ends = [plane.along(x[inside], y[inside] + side * strips.half_height) for side in (-1, 1)]
     v = ends[0][:, None] + (ends[1] - ends[0])[:, None] * (np.arange(n_rows) + 0.5) / n_rows
-    total, edges = np.histogram(v, _BINS, (-_BEYOND, 1 + _BEYOND), weights=together[inside])
-    count = np.histogram(v, edges)[0]
-    return (edges[1:] + edges[:-1]) / 2, np.asarray(total / np.maximum(count, 1))
+    extent = 1 + 2 * _BEYOND
+    # One bin more at either end takes what lies beyond.
+    number = np.clip((v + _BEYOND) * (_BINS / extent) + 1, 0, _BINS + 1).astype(np.int64).ravel()
+    total = np.bincount(number, together[inside].ravel(), _BINS + 2)[1:-1]
+    count = np.bincount(number, minlength=_BINS + 2)[1:-1]
+    middles = (np.arange(_BINS) + 0.5) * (extent / _BINS) - _BEYOND
+    return middles.astype(np.float64), np.asarray(total / np.maximum(count, 1), np.float64)

@@ -18,11 +18,11 @@ class FinderSettings:
     n_windows: int = 16
     n_fifth_strips: int = 150
     #: Rows that are averaged, as a share of the lag at which the correlation of neighbouring strips falls to half its
-    #: value at lag one; their minimum and maximum; spacing of the strips used.
+    #: value at lag one; their minimum and maximum; number of pairs of strips used.
     short_share: float = 0.8
     min_short_rows: int = 2
     max_short_rows: int = 6
-    sampled_strips: int = 8
+    sampled_strips: int = 25
     #: Share of the strips, the least coherent, that row noise is estimated from; share with the clearest stripes.
     dark_share: float = 0.3
     bright_share: float = 0.2
@@ -30,8 +30,8 @@ class FinderSettings:
     max_lag: int = 40
     #: Columns are narrow if the coherence at the far distance, picture widths, is below this share of that at the near.
     near_widths: float = 0.004
-    far_widths: float = 0.02
-    narrow_ratio: float = 0.6
+    far_widths: float = 0.01
+    narrow_ratio: float = 0.72
     #: Two screens lie apart if strips between them have less than this share of the light, over this many picture
     #: widths; share of the light that each has, and mean coherence of all strips, at least.
     gap_light: float = 0.25
@@ -55,7 +55,7 @@ class FinderSettings:
     #: Distance of the pairs of strips that show the comb of borders best.
     pair_distance: float = 0.72
     #: Combs that are tried as grids.
-    n_combs: int = 8
+    n_combs: int = 4
     #: Minimum height of a comb, standard deviations by chance; contrast of the highest comb, as a share of the light it
     #: explains, from which no further combs are tried.
     min_comb: float = 6.0
@@ -72,18 +72,15 @@ class FinderSettings:
     radial_sd: float = 0.004
     #: Weight of the log-likelihood that borders add, relative to that of the light that waveforms explain.
     contrast_weight: float = 1.5
-    #: Steps on every second window, of a grid with one end slipped by a column, of narrow columns at each reach, and
-    #: last steps on all windows.
+    #: Steps on every second window, of narrow columns in one part of a picture, and last steps on all windows.
     first_steps: int = 3
-    slip_steps: int = 2
     narrow_steps: int = 4
     last_steps: int = 2
     #: Factor by which the followed width of a grid of narrow columns grows at a time.
-    reach_gain: float = 1.6
-    #: Minimum contrast, as a share of the explained light times the root of the number of rows.
+    reach_gain: float = 1.4
+    #: Minimum contrast, as a share of the explained light times the root of the number of rows; that of narrow columns.
     min_contrast: float = 0.95
-    #: Minimum contrast of narrow columns in the best part of a picture, as a share of the explained light.
-    min_part_contrast: float = 0.05
+    min_narrow_contrast: float = 1.5
     #: Focal length of a camera that no profile describes, picture widths.
     focal_widths: float = 0.8
     #: Gauss-Newton steps with decided slots, and prior standard deviations of the finder's columns: shift and widths in

@@ -20,6 +20,8 @@ from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
 _Real = TypeVar("_Real", np.float32, np.float64)
+#: Averaged rows whose mean the band pass takes off.
+LONG_ROWS = 7
 #: Arrays by block and strip.
 _OF_STRIPS = ("changes", "lit", "level", "raw_x", "raw_y", "x", "y")
 
@@ -75,6 +77,10 @@ class Strips:
         arrays = {name: getattr(self, name)[chosen] for name in _OF_STRIPS}
         return replace(self, **arrays)
 
+    def part(self, number: int) -> Strips:
+        """The blocks of one part of the width."""
+        return self.blocks(slice(number * self.n_windows, (number + 1) * self.n_windows))
+
     def between(self, start: int, end: int) -> Strips:
         """The strips from `start` on, up to but without `end`, of every block."""
         arrays = {name: getattr(self, name)[:, start:end] for name in _OF_STRIPS}
@@ -101,38 +107,36 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
         lens: of the picture, if known.
         n_parts: parts of the width with strips of their own.
     """
-    width, height, n_windows = plane.width, plane.height, SETTINGS.n_windows
     light, x = _light_of_strips(plane, n_parts)
-    short = _short_rows(light)
-    band = _band_passed(light, short)
-    rows = band.shape[1] // n_windows
-    middles = (np.arange(n_windows) * rows + (rows - 1) / 2) * short
+    short, n_windows = _short_rows(light), SETTINGS.n_windows
+    light = _means_of_rows(light, short)
+    rows = light.shape[1] // n_windows
+    middles = (np.arange(n_windows) + 0.5) * rows * short - 0.5
     points = np.stack(np.meshgrid(x, middles), axis=-1)
-    quiet, lit, noise = _without_row_noise(_windows(band))
-    level = light[:, : rows * short * n_windows].reshape(x.size, n_windows, rows * short).mean(axis=2).T
+    changes, lit, noise = _without_row_noise(_windows(_band_passed(light)))
 
     def parted(values: NDArray[_Real]) -> NDArray[_Real]:
         """(W, S, ...) as (parts x W, S / parts, ...)."""
         split = values.reshape(n_windows, n_parts, -1, *values.shape[2:])
-        return np.concatenate(np.moveaxis(split, 1, 0))
+        return np.ascontiguousarray(np.moveaxis(split, 1, 0)).reshape(n_parts * n_windows, -1, *values.shape[2:])
 
-    raw_x, raw_y = (parted(values) for values in flat_places(points, width, height, None))
-    x_flat, y_flat = (parted(values) for values in flat_places(points, width, height, lens))
+    stored, flat = (flat_places(points, plane.width, plane.height, model) for model in (None, lens))
+    raw_x, raw_y, x_flat, y_flat = (parted(values) for values in (*stored, *flat))
     return Strips(
-        parted(quiet),
+        parted(changes),
         parted(lit),
-        parted(np.asarray(level, np.float32)),
+        parted(light.reshape(x.size, n_windows, rows).mean(axis=2).T),
         raw_x,
         raw_y,
         x_flat,
         y_flat,
-        half_height=rows * short / 2 / width,
+        half_height=rows * short / 2 / plane.width,
         row_noise=noise,
         short_rows=short,
-        n_rows=_independent_rows(quiet, lit),
+        n_rows=_independent_rows(changes, lit),
         n_parts=n_parts,
-        width=width,
-        height=height,
+        width=plane.width,
+        height=plane.height,
         lens=lens,
     )
 
@@ -169,20 +173,28 @@ def _lit_coherence(strips: Strips, widths: float) -> float:
     return float((strips.coherence(distance) * share).sum() / (np.square(share).sum() + TINY))
 
 
-def _band_passed(light: Float32Array, short: int) -> Float32Array:
-    """(S, R / short) light averaged over a few rows, minus its mean over many."""
+def _means_of_rows(light: Float32Array, short: int) -> Float32Array:
+    """(S, R) means over `short` rows of light (S, rows), R a multiple of the number of windows."""
     import cv2
 
-    whole = light.shape[1] // short * short
-    return np.asarray((cv2.blur(light, (short, 1)) - cv2.blur(light, (8 * short, 1)))[:, :whole:short], np.float32)
+    n = light.shape[1] // (short * SETTINGS.n_windows) * SETTINGS.n_windows
+    return np.asarray(cv2.resize(light[:, : n * short], (n, len(light)), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _band_passed(light: Float32Array) -> Float32Array:
+    """(S, R) light minus its mean over `LONG_ROWS` rows."""
+    import cv2
+
+    return np.asarray(light - cv2.blur(light, (LONG_ROWS, 1)), np.float32)
 
 
 def _short_rows(light: Float32Array) -> int:
     """Rows that may be averaged without losing the slots, from the correlation of neighbouring strips over lags."""
     import cv2
 
-    max_rows, every = SETTINGS.max_short_rows, SETTINGS.sampled_strips
-    left, right = (light[start::every][: len(light) // every] for start in (0, 1))
+    max_rows, every = SETTINGS.max_short_rows, max(len(light) // SETTINGS.sampled_strips, 2)
+    n = len(light) // every
+    left, right = (light[start::every][:n] for start in (0, 1))
     left, right = (part - cv2.blur(part, (8 * max_rows + 1, 1)) for part in (left, right))
     n_lags = 2 * max_rows
     correlation = [float(np.einsum("sr,sr->", left[:, :-lag], right[:, lag:])) for lag in range(1, n_lags)]
@@ -194,10 +206,10 @@ def _short_rows(light: Float32Array) -> int:
 
 def _windows(band: Float32Array) -> Float32Array:
     """(W, S, R) windows of rows, each strip scaled to a mean square of one."""
-    rows = band.shape[1] // SETTINGS.n_windows
-    changes = band[:, : SETTINGS.n_windows * rows].reshape(len(band), SETTINGS.n_windows, rows).swapaxes(0, 1)
-    power = np.einsum("wsr,wsr->ws", changes, changes)
-    return np.asarray(changes / (np.sqrt(power / np.float32(rows)) + np.float32(TINY))[..., None], np.float32)
+    changes = np.ascontiguousarray(band.reshape(len(band), SETTINGS.n_windows, -1).swapaxes(0, 1))
+    power = np.einsum("wsr,wsr->ws", changes, changes) / np.float32(changes.shape[2])
+    changes /= (np.sqrt(power) + np.float32(TINY))[..., None]
+    return changes
 
 
 def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
@@ -206,8 +218,8 @@ def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Arra
     dark = np.argsort(_smooth(_neighbours(changes), 5, 1), axis=1)[:, :n_dark]
     noise = np.take_along_axis(changes, dark[..., None], axis=1).mean(axis=1)
     power = np.einsum("wr,wr->w", noise, noise) + np.float32(TINY)
-    share = np.einsum("wsr,wr->ws", changes, noise) / power[:, None]
-    quiet = changes - share[..., None] * noise[:, None]
+    share = np.matmul(changes, noise[..., None]) / power[:, None, None]
+    quiet = np.asarray(changes - share * noise[:, None], np.float32)
     return quiet, np.clip(_smooth(_neighbours(quiet), 3, 3), 0, 1), noise
 
 

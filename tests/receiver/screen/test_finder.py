@@ -19,10 +19,10 @@ from rxcli.receiver.screen.find import (
     OutlineCandidate,
     find_outlines,
     follow_outline,
-    slipped_grid,
+    shows_columns_plainly,
     why_useless,
 )
-from rxcli.receiver.screen.grid import columns_at, grid_between, grid_through
+from rxcli.receiver.screen.grid import columns_at, grid_between
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.screen.rows import lit_range
@@ -122,7 +122,7 @@ def test_the_grid_is_found_whatever_the_picture(picture: str) -> None:
 def test_where_light_reaches_the_ends_or_a_film_lies_in_the_middle_the_first_column_is_plain(picture: str) -> None:
     candidates = found(picture)
     assert round(float(np.median(apart(candidates[0])))) == 0
-    assert len(candidates) == 1 or candidates[1].log_odds < -2
+    assert len(candidates) == 1 or candidates[1].log_odds < -1.5
 
 
 def test_where_the_outer_columns_are_dark_others_are_proposed() -> None:
@@ -249,15 +249,6 @@ def test_the_true_grid_explains_more_than_others_and_is_reached_from_near() -> N
     assert np.abs(off).max() < 0.3
 
 
-def test_a_grid_that_counts_a_column_too_many_at_one_end_is_mended() -> None:
-    strips, true = read_strips(drawn("dark sides")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
-    x, y = strips.x.ravel(), strips.y.ravel()
-    wrong = grid_through(true, x, y, columns_at(true.numbers, x, y) + (strips.raw_x.ravel() - 0.5) ** 2)
-    mended = slipped_grid(strips, wrong, 0.45)
-    off = [np.abs(columns_at(grid.numbers, x, y) - columns_at(true.numbers, x, y)).max() for grid in (mended, wrong)]
-    assert off[0] < 0.3 < off[1]
-
-
 def profile_of(picture: str) -> LightProfile:
     strips, grid = read_strips(drawn(picture)), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
     return light_profile(strips, predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), 0.45), grid)
@@ -337,6 +328,12 @@ def test_a_hundred_columns_are_found_in_a_film_with_bars() -> None:
 def test_wide_columns_are_not_taken_for_narrow_ones() -> None:
     assert shows_narrow_columns(read_strips(plane_of(narrow_film())))
     assert not shows_narrow_columns(read_strips(drawn("film")))
+
+
+def test_plain_columns_are_told_from_none() -> None:
+    assert shows_columns_plainly(drawn("film"), WIDE.sigma)
+    noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
+    assert not shows_columns_plainly(plane_of(noise), WIDE.sigma)
 
 
 def test_a_screen_that_moved_a_little_is_followed_and_a_lost_one_is_noticed() -> None:
