@@ -9,11 +9,6 @@ from rxcli.receiver.screen import geometry
 from rxcli.types import Frame, Lens
 
 
-def has_profile(frame: Frame, options: ReceiverOptions) -> bool:
-    """Whether a profile describes the frame's camera."""
-    return _profile_of(frame, options) is not None
-
-
 def _profile_of(frame: Frame, options: ReceiverOptions) -> CameraProfile | None:
     meta = frame.metadata
     if options.force_camera:

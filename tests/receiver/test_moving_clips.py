@@ -19,7 +19,7 @@ from rxcli.lab.simulate.scenes import Change, Scene, preset
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS
-from rxcli.receiver.clip.acquiring import Start
+from rxcli.receiver.clip.common_clock import Start
 from rxcli.receiver.context import FrameContext
 from rxcli.receiver.pipeline import receive
 from rxcli.receiver.screen.registration import ScreenTexture
@@ -290,9 +290,9 @@ def test_a_common_clock_that_does_not_fit_a_frame_is_dropped(monkeypatch: pytest
         time.begin(frames[0].index, frames[0].time_s, 5.0, screen.slot_rate_hz / 120)
         return Start(screen, (screen,), time, 2.0)
 
-    monkeypatch.setattr("rxcli.receiver.clip.receiver.shows_little", lambda _: True)
-    monkeypatch.setattr("rxcli.receiver.clip.camera.agree", wrong)
-    monkeypatch.setattr("rxcli.receiver.clip.receiver.acquisition_at", lambda *_: None)
+    monkeypatch.setattr("rxcli.receiver.clip.acquiring.shows_little", lambda _: True)
+    monkeypatch.setattr("rxcli.receiver.clip.common_clock._agreed", wrong)
+    monkeypatch.setattr("rxcli.receiver.clip.camera.acquisition_at", lambda *_: None)
     results, score = received(clip)
     right = score.error_free + score.extra_error_free
     assert right >= 0.8 * (plain.error_free + plain.extra_error_free) > 0

@@ -1,9 +1,9 @@
 """Clips: what one frame teaches is used on the next. The stages are those of `rxcli.receiver.pipeline`.
 
-`receiver` has the three states and the step from frame to frame. The first frames agree on an outline and, where each
-shows little, on a clock (`acquiring`); the camera is known or estimated (`camera`). From then on outline, clock,
-picture, light spread and weights are known: the strips are read where they were (`sampling.tracked`), the picture is
-taken out (`scene`, by `channel.known_picture`), the clock is predicted and checked against the header
+`receiver` has the three states and the step from frame to frame. The first frames agree on an outline (`acquiring`)
+and, where each shows little, on a clock (`common_clock`); the camera is known or estimated (`camera`). From then on
+outline, clock, picture and light spread are known: the strips are read where they were (`sampling.tracked`), the
+picture is taken out (`scene`, by `channel.known_picture`), the clock is predicted and checked against the header
 (`sync.tracking`). Where the check fails, the frame is received like a photograph again. What frames show of a burst is
 added up before it is detected (`bursts`); a packet stands in the last frame that shows its burst, so results wait a
 frame (`ledger`).

@@ -1,200 +1,97 @@
-"""The first frames of a clip: they agree on where the screen is and, where each shows little, on a clock.
+"""The first frames of a clip: they agree on where the screen is, and the surest of their cameras counts.
 
 The strips of a whole clip lie where its first frame has the screen, and a single dark frame may be wrong by twenty
 pixels there. The texture of the picture gives the motion of the screen from the first frame to the next ones. The
 outlines found in these are carried back, and their median is used. If the second agrees, two are enough.
-
-A frame that shows less than two packets may show no whole header, or show payload that looks like one. Over several
-frames the headers come back at the same place in the packet's length, and nothing else does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.options import ReceiverOptions
-from rxcli.profiles import ScreenProfile
-from rxcli.receiver.acquisition import (
-    Acquisition,
-    distinct_screens,
-    noise_of,
-    sample_columns,
-    variants_of,
-)
+from rxcli.receiver.clip.camera import ClipCamera, Located
+from rxcli.receiver.clip.common_clock import shows_little
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.context import Camera, FrameContext, Timer
+from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.screen.registration import ScreenTexture
-from rxcli.receiver.search import search
-from rxcli.receiver.sync import clock as sync
-from rxcli.receiver.sync.settings import SETTINGS as sync_settings
-from rxcli.receiver.sync.tracking import LinkTime
-from rxcli.types import Clock, FloatArray, Frame, RowProfiles
-
-#: Errors of the frames' period that are tried, in slots over all frames: times are rounded to milliseconds.
-_DRIFTS = np.linspace(-6, 6, 25)
+from rxcli.types import FloatArray, Frame
 
 
-class FirstOutline:
-    """The outline in the first frame.
+@dataclass(frozen=True, slots=True, eq=False)
+class FirstFrames:
+    """The first frames that show screen and camera."""
 
-    Args:
-        frame: the first.
-        corners: (4, 2) of the screen as found there.
-        options: where they name the corners, there is nothing to find.
-        known: that frame with its camera, where it is known already.
-    """
+    frames: tuple[Frame, ...]
+    #: Where the screen is in the first of them, with the surest of their cameras.
+    located: Located
+    #: Of the screen; None where there is nothing to compare an outline with, or the user gave the corners.
+    texture: ScreenTexture | None
+    #: Corners (4, 2) that were found in each frame, carried back to the first, less those found there.
+    differences: tuple[FloatArray, ...]
 
-    def __init__(
-        self, frame: Frame, corners: FloatArray, options: ReceiverOptions, known: FrameContext | None = None
-    ) -> None:
-        self._options, self._known = options, known
-        self._first = corners
-        self._width = float(np.linalg.norm(corners[1] - corners[0]))
-        self._differences = [np.zeros_like(corners)]
-        self._texture = None if options.corners is not None else ScreenTexture(frame, corners, None)
+    @classmethod
+    def begin(cls, frame: Frame, camera: ClipCamera) -> FirstFrames | Failure:
+        """Search the first frame."""
+        located = camera.locate(frame, Timer())
+        if isinstance(located, Failure):
+            return located
+        corners = located.context.corners
+        texture = None if camera.options.corners is not None else ScreenTexture(frame, corners, None)
+        return cls((frame,), located, texture, (np.zeros_like(corners),))
 
     @property
-    def settled(self) -> bool:
-        """Whether no further frame is asked."""
-        if self._texture is None or len(self._differences) >= SETTINGS.max_searches:
+    def shows_little(self) -> bool:
+        """Whether each shows too few packets to find its clock alone."""
+        return shows_little(self.located.context)
+
+    @property
+    def are_enough(self) -> bool:
+        """Whether no further frame is needed: the outline and, where each shows little, camera and clock are sure."""
+        if self.located.camera_error == np.inf:
+            n_needed = SETTINGS.frames_held_long if self.shows_little else SETTINGS.frames_together
+        else:
+            n_needed = SETTINGS.frames_together if self.shows_little else 1
+        return self._agree and len(self.frames) >= n_needed
+
+    @property
+    def _agree(self) -> bool:
+        """Whether the outline is sure."""
+        found = self.differences
+        if self.texture is None or len(found) >= SETTINGS.max_searches:
             return True
-        return len(self._differences) == 2 and bool(
-            np.abs(self._differences[1]).max() < SETTINGS.outlines_agree * self._width
-        )
+        return len(found) == 2 and bool(np.abs(found[1]).max() < SETTINGS.outlines_agree * self._width)
 
     @property
-    def corners(self) -> FloatArray:
-        """(4, 2) in the first frame, by all frames so far."""
-        return self._first + np.median(self._differences, axis=0)
+    def _width(self) -> float:
+        left, right, *_ = self.located.context.corners
+        return float(np.linalg.norm(right - left))
 
-    def add(self, frame: Frame) -> None:
-        """Search the next frame, too."""
-        if self.settled or self._texture is None:
-            return
-        moved = self._texture.find(frame)
+    def agreed(self) -> Located:
+        """The first frame with the outline on which all of them agree."""
+        return self.located.moved_to(self.located.context.corners + np.median(self.differences, axis=0))
+
+    def with_frame(self, frame: Frame, camera: ClipCamera) -> FirstFrames:
+        """These frames and one more; it is searched for its outline and its camera as far as they are unsure."""
+        longer, located = replace(self, frames=(*self.frames, frame)), self.located
+        unsure = located.camera_error == np.inf or (located.camera_error > 0 and self.shows_little)
+        if self._agree and not unsure:
+            return longer
+        found = (camera if unsure else replace(camera, context=located.context)).locate(frame, Timer())
+        longer = replace(longer, located=located.with_surer_camera(found) if unsure else located)
+        return longer if self._agree else longer._compared(frame, found)
+
+    def _compared(self, frame: Frame, found: Located | Failure) -> FirstFrames:
+        """The same with the outline found in a further frame, less its motion since the first."""
+        assert self.texture is not None
+        moved = self.texture.find(frame)
         if not moved.is_precise:
-            moved = self._texture.with_outline(moved, self._first)
-        found = search(frame, self._options, Timer(), self._known)
-        outline = found.outline
-        if outline is None or not moved.fits or self._is_far(outline.corners - moved.corners):
-            # Nothing to compare with: what was found so far must do.
-            self._texture = None
-            return
-        self._texture.learn(frame, moved)
-        self._differences.append(outline.corners - moved.corners)
-
-    def _is_far(self, difference: FloatArray) -> bool:
-        return bool(np.abs(difference).max() > self._width / 2)
-
-
-@dataclass(frozen=True, slots=True)
-class Start:
-    """What the first frames agree on."""
-
-    screen: ScreenProfile
-    #: The screen and others that differ only in the number of copies per burst.
-    variants: tuple[ScreenProfile, ...]
-    time: LinkTime
-    #: How much likelier the headers' place is than the best elsewhere.
-    lead: float
-
-
-def shows_little(context: FrameContext) -> bool:
-    """Whether a frame shows too few packets to find its clock alone."""
-    corners, height = context.corners, context.frame.height
-    shown = min(float(corners[:, 1].max()), height - 1.0) - max(float(corners[:, 1].min()), 0.0)
-    return shown * context.camera.line_delay_s < SETTINGS.few_packets * min(
-        screen.packet_s for screen in context.screens
-    )
-
-
-def agree(frames: Sequence[Frame], context: FrameContext) -> Start | None:
-    """The clock that the headers of several frames agree on, None where they do not; `context` is of the first."""
-    best: Start | None = None
-    for n_columns in sorted({screen.columns for screen in context.screens}):
-        profiles_of = [sample_columns(replace(context, frame=frame), n_columns) for frame in frames]
-        for screen in (s for s in distinct_screens(context.screens) if s.columns == n_columns):
-            lead, slot, period = _phase(frames, profiles_of, screen, context.camera)
-            if lead > SETTINGS.min_lead and (best is None or lead > best.lead):
-                time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
-                time.begin(frames[0].index, frames[0].time_s, slot, period)
-                best = Start(screen, variants_of(screen, context.screens), time, lead)
-    return best
-
-
-def acquisition_at(start: Start, context: FrameContext) -> Acquisition | None:
-    """What the clip's clock predicts for a frame; None where nothing of the screen is in the picture."""
-    screen, frame, camera = start.screen, context.frame, context.camera
-    profiles = sample_columns(context, screen.columns)
-    rows = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
-    if rows.size == 0:
-        return None
-    rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
-    template = Clock(
-        rows_per_slot=rows_per_slot,
-        exposure_slots=camera.exposure_s * screen.slot_rate_hz,
-        packet_slots=screen.packet_slots,
-        row0=0.0,
-        n_slots=0,
-        first_slot=0,
-        burst=np.zeros(0, np.int64),
-        delay_slots=np.zeros(screen.columns),
-        header_peak_ratio=1.0,
-    )
-    n_slots = int(np.ceil((rows[-1] - rows[0] + 1) / rows_per_slot)) + 1
-    top = float(profiles.rows[rows[0]]) - 0.5
-    clock = start.time.clock_at(frame.index, frame.time_s, template, n_slots, top)
-    return None if clock is None else Acquisition(screen, profiles, clock, variants=start.variants)
-
-
-def _phase(
-    frames: Sequence[Frame], profiles_of: Sequence[RowProfiles], screen: ScreenProfile, camera: Camera
-) -> tuple[float, float, float]:
-    """Lead of the best place of the headers; slot of row 0 of the first frame; slots from frame to frame."""
-    rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
-    responses = [_response(profiles, rows_per_slot) for profiles in profiles_of]
-    times = np.array([frame.time_s for frame in frames])
-    numbers = np.array([frame.index for frame in frames])
-    slope = float(np.polyfit(numbers - numbers[0], times - times[0], 1)[0])
-    most, best = 0.0, (0.0, 0.0, slope * screen.slot_rate_hz)
-    for drift in _DRIFTS:
-        period = slope * screen.slot_rate_hz + drift / max(len(frames) - 1, 1)
-        starts = (numbers - numbers[0]) * period
-        power, lead, place = _fold(responses, starts, screen.packet_slots)
-        if power > most:
-            most, best = power, (lead, -place, period)
-    return best
-
-
-def _response(profiles: RowProfiles, rows_per_slot: float) -> tuple[FloatArray, FloatArray]:
-    """Slots since the exposure of sensor row 0, and how much a header seems to start there."""
-    shown = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
-    if shown.size == 0:
-        return np.zeros(0), np.zeros(0)
-    q = sync_settings.search_samples
-    top, step = float(profiles.rows[shown[0]]) - 0.5, rows_per_slot / q
-    light, valid = sync.resample(profiles, top, step, int(shown.size / step))
-    pooled, weight = sync.contrast(
-        light, valid, sync_settings.search_samples, noise_of(profiles) / np.sqrt(max(step, 1.0))
-    )
-    response = sync.header_response(pooled, weight, sync_settings.search_samples).mean(axis=0)
-    return top / rows_per_slot + np.arange(response.size) / sync_settings.search_samples, np.maximum(response, 0) ** 2
-
-
-def _fold(
-    responses: Sequence[tuple[FloatArray, FloatArray]], starts: FloatArray, packet_slots: int
-) -> tuple[float, float, float]:
-    """Power of the best place of a header in the packet's length, its lead, and that place in slots."""
-    q = sync_settings.search_samples
-    n = packet_slots * q
-    score = np.zeros(n)
-    for (slots, response), start in zip(responses, starts, strict=True):
-        place = np.round((slots + start) * q).astype(np.int64) % n
-        np.add.at(score, place, response)
-    # Stamps are rounded to milliseconds: neighbouring places are equivalent.
-    score = (score + np.roll(score, 1) + np.roll(score, -1)) / 3
-    place, lead = sync.header_comb(score, q)
-    return float(score.max()), lead, place / q
+            moved = self.texture.with_outline(moved, self.located.context.corners)
+        if found.outline is None or not moved.fits:
+            return replace(self, texture=None)
+        difference = found.outline.corners - moved.corners
+        if np.abs(difference).max() > self._width / 2:
+            return replace(self, texture=None)
+        self.texture.learn(frame, moved)
+        return replace(self, differences=(*self.differences, difference))

@@ -83,13 +83,14 @@ class Burst:
         )
 
 
-def bursts_of(view: View, numbers: IntArray, tried: BoolArray) -> list[Burst]:
-    """What a frame shows of its bursts (B,); `tried` (C,) are the columns to detect."""
+def bursts_of(view: View, tried: BoolArray) -> list[Burst]:
+    """What a frame shows of its bursts; `tried` (C,) are the columns to detect."""
+    assert view.numbers is not None
     own = view.bursts
     metrics = channel.by_burst(own.metrics, own.clock)
     return [
         Burst(number, metrics[index], own.shown[own.clock.burst == index].sum(axis=0), (own.frame,), own.tracked, tried)
-        for index, number in enumerate(numbers.tolist())
+        for index, number in enumerate(view.numbers.tolist())
     ]
 
 
@@ -100,9 +101,10 @@ def has_light(view: View) -> BoolArray:
     return np.asarray(np.median(view.snr, axis=1) >= SETTINGS.dark_snr)
 
 
-def lit_slots(view: View, numbers: IntArray, bursts: Sequence[Burst]) -> Float32Array:
-    """(C, N) probability that each slot of a frame is lit, by what is known of its bursts (B,)."""
-    clock = view.bursts.clock
+def lit_slots(view: View, bursts: Sequence[Burst]) -> Float32Array:
+    """(C, N) probability that each slot of a frame is lit, by what is known of its bursts."""
+    assert view.numbers is not None
+    numbers, clock = view.numbers, view.bursts.clock
     lit = np.full((numbers.size, len(view.snr), clock.packet_slots), 0.5, np.float32)
     for burst in bursts:
         lit[numbers == burst.number] = burst.posteriors.lit[0]

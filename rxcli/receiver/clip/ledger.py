@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.clip.acquiring import Start
 from rxcli.receiver.clip.bursts import Burst, bursts_of, doubts, has_light, lit_slots
+from rxcli.receiver.clip.common_clock import Start
 from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View, Waiting
@@ -23,7 +24,6 @@ from rxcli.receiver.sync import tracking
 from rxcli.results.dump import dump_stages
 from rxcli.types import (
     BoolArray,
-    Float32Array,
     FloatArray,
     Frame,
     FrameResult,
@@ -53,6 +53,28 @@ class _Link:
     stamps_judged: bool = False
     #: (1, C) log-likelihood ratio of the headers of all bursts so far; None before any.
     header_llr: FloatArray | None = None
+
+    def compare(self, view: View) -> None:
+        """Update the phase of the bursts with a frame."""
+        copies = view.bursts.clock.to_copies(slot_llr(view.bursts.metrics)).transpose(1, 0, 2)
+        self.phase.update(view.bursts.first_copy, np.asarray(copies * (view.bursts.shown > 0), np.float64))
+
+    def number(self, view: View) -> None:
+        """Number the bursts of a frame."""
+        clock = view.bursts.clock
+        bursts = self.phase.burst_of(view.bursts.first_copy + np.arange(clock.n_copies))
+        numbers = np.unique(bursts)
+        view.bursts = replace(view.bursts, clock=replace(clock, burst=bursts - numbers[0]))
+        view.numbers = numbers + self.offset
+
+    def predicted(self, frame: Frame, rows: FloatArray, rows_per_slot: float) -> list[int]:
+        """Numbers of the bursts that the rows (R,) of a further frame should show; none if that is not known."""
+        slot = self.time.predict(frame.index, frame.time_s)
+        if slot is None or not self.phase.settled:
+            return []
+        top, bottom = ((slot + rows[[0, -1]] / rows_per_slot) // self.time.packet_slots).astype(np.int64)
+        numbers: list[int] = (np.unique(self.phase.burst_of(np.arange(top, bottom + 1))) + self.offset).tolist()
+        return numbers
 
     def headerless(self, closed: Sequence[confidence.BurstInClip], n_columns: int) -> BoolArray:
         """Add closed bursts; returns (C,) the columns that have shown no headers."""
@@ -92,12 +114,9 @@ class Ledger:
         self.start: Start | None = None
         #: Probability that the screen's columns are numbered right.
         self.certainty = 1.0
-        #: Number of first frames of a scene that are held back; 0: none.
+        #: Number of first frames of a scene to hold back; and number that is held back now, 0: none.
+        self._n_first = SETTINGS.frames_held if "tracking" in options.skip else 0
         self._n_held = self._n_first
-
-    @property
-    def _n_first(self) -> int:
-        return SETTINGS.frames_held if "tracking" in self._options.skip else 0
 
     @property
     def holds_more(self) -> bool:
@@ -116,21 +135,21 @@ class Ledger:
             return _RETIMED
         return _SLOW_MOTION.format(self._stretch) if self._stretch != 1 else None
 
+    @property
+    def _views(self) -> list[View]:
+        """The frames that wait and were received."""
+        return [waiting.view for waiting in self._waiting if waiting.view is not None]
+
     def has_certain_bursts(self, frame: Frame, scene: TrackedScreen) -> bool:
         """Whether all bursts that a frame should show are certain in all lit columns."""
-        link = self._link
-        if link is None or scene.last is None or not link.phase.settled or self._n_held:
+        last = scene.last
+        if self._link is None or last is None or self._n_held:
             return False
-        last, (top, bottom) = scene.last, scene.rows[[0, -1]]
-        slot, rows_per_slot = link.time.predict(frame.index, frame.time_s), last.acquisition.clock.rows_per_slot
-        if slot is None:
-            return False
-        ends = (slot + np.array([top, bottom]) / rows_per_slot) // link.time.packet_slots
-        numbers = np.unique(link.phase.burst_of(np.arange(ends[0], ends[1] + 1).astype(np.int64))) + link.offset
-        lit = np.median(last.snr, axis=1) >= 1.0
-        return bool(lit.any()) and all(
-            number in self._bursts and self._bursts[number].certain[lit].all() for number in numbers.tolist()
-        )
+        numbers = self._link.predicted(frame, scene.rows, last.acquisition.clock.rows_per_slot)
+        lit = np.median(last.snr, axis=1) >= 1
+        bursts = [self._bursts[number] for number in numbers if number in self._bursts]
+        certain = len(bursts) == len(numbers) > 0 and all(burst.certain[lit].all() for burst in bursts)
+        return certain and bool(lit.any())
 
     def add(self, waiting: Waiting, *, scene_ends: bool = False) -> list[FrameResult]:
         """Add a frame without packets; returns the results that are complete, all of them where the scene ends."""
@@ -145,172 +164,122 @@ class Ledger:
             view: what was received of it.
             scene: that the frame belongs to; None where it is not tracked.
         """
-        frame = view.context.frame
-        done, first_copy = self._first_copy(view, frame)
-        waiting.view = view
-        self._scene = scene
-        assert self._link is not None
-        self._link.last_time_s = frame.time_s
+        frame, link, first_copy, done = view.context.frame, self._link, None, []
+        if link is not None:
+            if self._stretch is not None and link.shape == _shape(view):
+                first_copy = link.time.update(frame.index, frame.time_s, view.bursts.clock)
+            if first_copy is None:
+                done = self._finish_scene()
+        if link is None or first_copy is None:
+            link, first_copy = self._begun_link(view, frame)
+        link.last_time_s = frame.time_s
         view.bursts = replace(view.bursts, first_copy=first_copy)
+        waiting.view, self._scene, self._link = view, scene, link
         self._waiting.append(waiting)
         with view.context.timer("detect"):
-            if not self._link.phase.settled:
-                self._compare(view)
-            n_unsettled = sum(w.view is not None and w.numbers is None for w in self._waiting)
-            if self._n_held and self._link.time.judged and not self._link.stamps_judged:
-                done += self._enter_anew()
-            if self._link.phase.settled or n_unsettled > SETTINGS.max_waiting_frames:
+            if not link.phase.settled:
+                link.compare(view)
+            if self._n_held and link.time.judged and not link.stamps_judged:
+                done += self._judge_stamps(link)
+                link = self._link
+            n_unsettled = sum(each.numbers is None for each in self._views)
+            if link.phase.settled or n_unsettled > SETTINGS.max_waiting_frames:
                 self._settle_bursts()
                 if self._n_held and len(self._waiting) >= self._n_held:
                     self._receive_first_again(at_last=False)
         return done + self._ready()
 
-    def _first_copy(self, view: View, frame: Frame) -> tuple[list[FrameResult], int]:
-        """Number of the frame's first copy; where it does not fit the link's time, that ends, with the results of its
-        scene, and begins anew."""
-        done: list[FrameResult] = []
-        if self._link is not None:
-            if self._stretch is not None and self._link.shape == _shape(view):
-                first_copy = self._link.time.update(frame.index, frame.time_s, view.bursts.clock)
-                if first_copy is not None:
-                    return [], first_copy
-            done = self._finish_scene()
-        return done, self._begin_link(view, frame)
-
-    def _begin_link(self, view: View, frame: Frame) -> int:
-        """Begin the link's time anew; returns the number of the frame's first copy in it."""
+    def _begun_link(self, view: View, frame: Frame) -> tuple[_Link, int]:
+        """Begin the link's time anew; also returns the number of the frame's first copy in it."""
         screen, clock = view.acquisition.screen, view.bursts.clock
         offset, stretch = self._next_number, self._stretch or 1.0
         if self._link is not None and offset:
             passed_s = (frame.time_s - self._link.last_time_s) / stretch
             offset += int(passed_s / (screen.packet_s * self._link.phase.repeats))
-        time, first_copy = tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch), None
-        if self.start is not None:
-            first_copy = self.start.time.update(frame.index, frame.time_s, clock)
-        if self.start is None or first_copy is None:
-            # The clock that the first frames seemed to share, if any, is not this frame's.
-            self.start, first_copy = None, time.update(frame.index, frame.time_s, clock)
-        else:
-            time = self.start.time
+        fresh = tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
+        time = fresh if self.start is None else self.start.time
+        first_copy = time.update(frame.index, frame.time_s, clock)
+        if first_copy is None:
+            # The clock that the first frames seemed to share is not this frame's.
+            self.start, time, first_copy = None, fresh, fresh.update(frame.index, frame.time_s, clock)
         assert first_copy is not None
-        phase = tracking.BurstPhase(view.acquisition.repeats)
-        self._link = _Link(time, phase, _shape(view), offset, frame.time_s, stamps_judged=self._stretch != 1)
         self._epoch += 1
         self._forget_bursts()
-        return first_copy
+        phase = tracking.BurstPhase(view.acquisition.repeats)
+        return _Link(time, phase, _shape(view), offset, frame.time_s, stamps_judged=self._stretch != 1), first_copy
 
-    def _enter_anew(self) -> list[FrameResult]:
+    def _judge_stamps(self, link: _Link) -> list[FrameResult]:
         """Where the stamps of the first frames are not the time, enter these frames anew; returns complete results."""
-        link, waiting = self._link, self._waiting
-        assert link is not None
         link.stamps_judged = True
-        view = next(each.view for each in waiting if each.view is not None)
+        view = self._views[0]
         shown = float(np.ptp(np.flatnonzero(view.acquisition.profiles.inside.any(axis=(0, 1)))))
         packet_s = view.acquisition.screen.packet_s / view.bursts.clock.packet_slots
         self._stretch = link.time.time_stamp_stretch(shown / view.bursts.clock.rows_per_slot * packet_s)
         if self._stretch == link.time.stretch:
             return []
-        self._waiting, self._link, scene, done = deque(), None, self._scene, []
+        waiting, scene, done = self._waiting, self._scene, []
+        self._waiting, self._link = deque(), None
         for each in waiting:
-            each.numbers, each.result = None, replace(each.result, message=self.message)
+            each.update(message=self.message)
+            if each.view is not None:
+                each.view.numbers = None
             done += self.add(each) if each.view is None else self.enter(each, each.view, scene)
         return done
 
-    def _compare(self, view: View) -> None:
-        """Update the phase of the bursts with a frame."""
-        assert self._link is not None
-        clock = view.bursts.clock
-        llr = slot_llr(view.bursts.metrics)
-        copies = clock.to_copies(llr).transpose(1, 0, 2) * (view.bursts.shown > 0)
-        self._link.phase.update(view.bursts.first_copy, np.asarray(copies, np.float64))
-
     def _settle_bursts(self) -> None:
-        """Enter all frames that waited for the phase of the bursts."""
-        for waiting in self._waiting:
-            if waiting.view is not None and waiting.numbers is None:
-                self._detect(waiting)
+        """Add all frames that waited for the phase of the bursts, and learn from them."""
+        for view in self._views:
+            if view.numbers is None:
+                self._add(view, dark_too=self._n_held > 0)
+                if self._scene is not None and view.flat is not None:
+                    self._scene.update(view, partial(lit_slots, view, self._open(view)))
 
-    def _detect(self, waiting: Waiting) -> None:
-        """Add a frame to its bursts, which are detected when their result is needed, and learn from it."""
-        self._add(waiting, dark_too=self._n_held > 0)
-        view, bursts = waiting.view, self._open(waiting)
-        if self._scene is not None and view is not None and view.flat is not None and bursts:
-            self._scene.update(view, lambda: self._lit(waiting))
-
-    def _add(self, waiting: Waiting, *, dark_too: bool) -> None:
+    def _add(self, view: View, *, dark_too: bool) -> None:
         """Add a frame to its bursts; dark columns are detected, too, if `dark_too`."""
-        view, link = waiting.view, self._link
-        assert view is not None
-        assert link is not None
-        clock = view.bursts.clock
-        bursts = link.phase.burst_of(view.bursts.first_copy + np.arange(clock.n_copies))
-        numbers = np.unique(bursts)
-        view.bursts = replace(view.bursts, clock=replace(clock, burst=bursts - numbers[0]))
-        waiting.numbers = numbers + link.offset
-        self._next_number = max(self._next_number, int(waiting.numbers[-1]) + 1)
-        dark_too |= "dark_columns" not in self._options.skip
-        tried = np.ones(len(view.snr), bool) if dark_too else has_light(view)
-        for burst in bursts_of(view, waiting.numbers, tried):
+        assert self._link is not None
+        self._link.number(view)
+        tried = has_light(view) | dark_too | ("dark_columns" not in self._options.skip)
+        for burst in bursts_of(view, tried):
             if burst.number in self._bursts:
                 self._bursts[burst.number] += burst
             elif burst.number > self._last_closed:
                 self._bursts[burst.number] = burst
+                self._next_number = max(self._next_number, burst.number + 1)
 
-    def _open(self, waiting: Waiting) -> list[Burst]:
+    def _open(self, view: View) -> list[Burst]:
         """The bursts of a frame that are still going on."""
-        numbers = [] if waiting.numbers is None else waiting.numbers.tolist()
+        numbers = [] if view.numbers is None else view.numbers.tolist()
         return [self._bursts[number] for number in numbers if number in self._bursts]
-
-    def _lit(self, waiting: Waiting) -> Float32Array:
-        """(C, N) probability that each slot of a frame is lit."""
-        assert waiting.view is not None
-        assert waiting.numbers is not None
-        return lit_slots(waiting.view, waiting.numbers, self._open(waiting))
-
-    def _doubts(self, waiting: Waiting) -> tuple[int, int]:
-        """Numbers of doubtful packets and of all packets in well-lit columns of a frame."""
-        return (0, 0) if waiting.view is None else doubts(waiting.view, self._open(waiting))
 
     def _forget_bursts(self) -> None:
         self._bursts, self._last_closed = {}, -1
 
-    # -- a second pass over the first frames -------------------------------------------------------------------------
-
     def _receive_first_again(self, at_last: bool) -> None:
         """The first frames once more: by then it is known better what is on the screen.
 
+        The picture is learned anew from all of them, and doubtful ones are measured with the picture of the others.
         Where that leaves doubt, more frames are waited for, unless it is `at_last` or results are wanted promptly.
         """
-        held = [each for each in self._waiting if self._can_receive_again(each)]
+        views, scene = [view for view in self._views if view.numbers is not None], self._scene
+        held = [] if scene is None else [view for view in views if scene.can_measure_again(view)]
         may_wait = self._n_held < SETTINGS.frames_held_long and not at_last and not self._options.prompt
-        if len(held) > 1:
-            self._measure_again(held)
+        if scene is not None and len(held) > 1:
+            lit = [lit_slots(view, self._open(view)) for view in held]
+            doubtful = [len(held) <= SETTINGS.frames_held or doubts(view, self._open(view))[0] > 0 for view in held]
+            scene.measure_again(held, lit, doubtful)
             self._forget_bursts()
-            for waiting in self._waiting:
-                if waiting.numbers is not None:
-                    self._add(waiting, dark_too=False)
-        doubtful, whole = np.sum([(0, 1), *map(self._doubts, held)], axis=0)
-        in_doubt = doubtful / whole > SETTINGS.much_doubt
+            for view in views:
+                self._add(view, dark_too=False)
+        doubts_of = [doubts(view, self._open(view)) for view in held]
+        in_doubt = sum(n for n, _ in doubts_of) > SETTINGS.much_doubt * sum(n for _, n in doubts_of)
         self._n_held = SETTINGS.frames_held_long if may_wait and in_doubt else 0
-
-    def _can_receive_again(self, waiting: Waiting) -> bool:
-        view, scene = waiting.view, self._scene
-        return waiting.numbers is not None and view is not None and scene is not None and scene.can_measure_again(view)
-
-    def _measure_again(self, held: list[Waiting]) -> None:
-        """Learn the picture anew from all held frames, and measure doubtful frames with the picture of the others."""
-        assert self._scene is not None
-        known = [self._lit(waiting) for waiting in held]
-        doubtful = [len(held) <= SETTINGS.frames_held or self._doubts(waiting)[0] > 0 for waiting in held]
-        self._scene.measure_again([w.view for w in held if w.view is not None], known, doubtful)
 
     # -- results ---------------------------------------------------------------------------------------------------
 
     def _finish_scene(self) -> list[FrameResult]:
         """The results of a scene that is over, by what was known of it."""
         done = self.finish()
-        self._scene = None
-        self._n_held = self._n_first
+        self._scene, self._n_held = None, self._n_first
         return done
 
     def finish(self) -> list[FrameResult]:
@@ -328,38 +297,34 @@ class Ledger:
         """Results of the frames whose bursts all ended, oldest first."""
         done: list[FrameResult] = []
         while self._waiting and not self._n_held:
+            view, views = self._waiting[0].view, self._views
             # Bursts may go on beyond frames that were passed over.
-            oldest, *later = (each for n, each in enumerate(self._waiting) if n == 0 or each.view is not None)
-            following = later[0] if later else None
-            unsettled = following is None or following.numbers is None
-            if oldest.view is not None and (oldest.numbers is None or unsettled):
+            following = views[1] if view is not None and len(views) > 1 else None
+            if view is not None and (view.numbers is None or following is None or following.numbers is None):
                 break
             done.append(self._report(self._waiting.popleft(), following))
         return done
 
-    def _report(self, waiting: Waiting, following: Waiting | None) -> FrameResult:
+    def _report(self, waiting: Waiting, following: View | None) -> FrameResult:
         view = waiting.view
-        if view is None or waiting.numbers is None:
+        if view is None or view.numbers is None or self._link is None:
             return waiting.result
         shown = [] if following is None or following.numbers is None else following.numbers.tolist()
-        going_on = [burst for burst in self._open(waiting) if burst.number in shown]
-        closed = [burst for burst in self._open(waiting) if burst.number not in shown]
+        going_on = [burst for burst in self._open(view) if burst.number in shown]
+        closed = [burst for burst in self._open(view) if burst.number not in shown]
         for burst in closed:
             self._last_closed = max(self._last_closed, burst.number)
             del self._bursts[burst.number]
             waiting.skip("dark_columns", int((~burst.tried).sum()))
         n_strips = view.acquisition.binned.light.shape[1]
-        ended = [burst.ended(int(waiting.numbers[0]), n_strips) for burst in closed]
-        headerless = np.zeros(len(view.snr), bool)
-        if self._link is not None:
-            headerless = self._link.headerless(ended, headerless.size)
-        sure = [np.zeros(headerless.size, np.float32), *(burst.probability for burst in going_on)]
+        ended = [burst.ended(int(view.numbers[0]), n_strips) for burst in closed]
+        probabilities = [np.zeros(len(view.snr), np.float32), *(burst.probability for burst in going_on)]
         columns = assemble.clip_results(
             view.bursts.clock,
             ended,
-            np.max(sure, axis=0),
+            np.max(probabilities, axis=0),
             view.snr,
-            headerless,
+            self._link.headerless(ended, len(view.snr)),
             self._options.min_confidence,
             self.certainty,
         )
@@ -368,12 +333,13 @@ class Ledger:
         if view.context.camera.reversed:
             columns = tuple(assemble.in_stored_rows(column, view.height) for column in columns)
         if self._options.dump_dir is not None:
-            found = _taps(waiting, view, ended)
+            found = _taps(waiting.result, view, ended)
             dump_stages(self._options.dump_dir, waiting.result.source, waiting.result.frame, found)
-        result = replace(waiting.result, columns=columns, status=assemble.clip_status(columns))
-        if self._link is not None:
-            result = replace(result, screen_profile=view.acquisition.variant(self._link.phase.repeats).name)
-        return replace(result, soft_bits=self._soft_bits(result, view, ended)) if self._options.soft_bits else result
+        name = view.acquisition.variant(self._link.phase.repeats).name
+        waiting.update(columns=columns, status=assemble.clip_status(columns), screen_profile=name)
+        if self._options.soft_bits:
+            waiting.update(soft_bits=self._soft_bits(waiting.result, view, ended))
+        return waiting.result
 
     def _soft_bits(
         self, result: FrameResult, view: View, ended: Sequence[confidence.BurstInClip]
@@ -389,9 +355,9 @@ def _shape(view: View) -> tuple[int, int]:
     return view.acquisition.screen.columns, view.bursts.clock.packet_slots
 
 
-def _taps(waiting: Waiting, view: View, ended: Sequence[confidence.BurstInClip]) -> dict[str, Any]:
+def _taps(result: FrameResult, view: View, ended: Sequence[confidence.BurstInClip]) -> dict[str, Any]:
     """What is written of a frame: as of a photograph, but strips as tracking samples them, and bursts that end here."""
-    found: dict[str, Any] = {"geometry.corners": waiting.result.corners, "clock": view.bursts.clock}
+    found: dict[str, Any] = {"geometry.corners": result.corners, "clock": view.bursts.clock}
     if view.light is not None and view.pose is not None:
         rows = view.pose.rows.astype(np.int64)
         found |= {"sampling.light": view.light, "sampling.inside": view.pose.map.inside, "sampling.rows": rows}
@@ -399,5 +365,5 @@ def _taps(waiting: Waiting, view: View, ended: Sequence[confidence.BurstInClip])
         found["sampling"] = view.acquisition.profiles
     numbers: IntArray = np.array([burst.number for burst in ended], np.int64)
     found |= {"channel.metrics": view.bursts.metrics, "bursts.shown": view.bursts.shown}
-    found |= {"bursts.number": waiting.numbers, "bursts.ended": numbers}
+    found |= {"bursts.number": view.numbers, "bursts.ended": numbers}
     return found | {f"detect.{burst.number}": burst.posteriors for burst in ended}

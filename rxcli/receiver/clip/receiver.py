@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.clip.acquiring import FirstOutline, acquisition_at, shows_little
-from rxcli.receiver.clip.camera import ClipCamera, Located, Settled
+from rxcli.receiver.clip.acquiring import FirstFrames
+from rxcli.receiver.clip.camera import Acquired, ClipCamera, Located
+from rxcli.receiver.clip.common_clock import common_clock
 from rxcli.receiver.clip.ledger import Ledger
 from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.settings import SETTINGS
@@ -25,13 +25,13 @@ from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.reception import Reception, shows_steady_light
-from rxcli.receiver.search import Found
 from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode
 from rxcli.receiver.sync import tracking
 from rxcli.types import FloatArray, Frame, FrameResult
 
 _SAME = "it shows the frame before once more, so that its time is not that of its rows; it was left out"
+_NOTHING_LIT = "no light of the screen's columns is seen; something may be in front of it"
 _NOMINAL_TIME = "the clip's time stamps do not advance here; its nominal frame rate was taken"
 
 
@@ -58,18 +58,8 @@ class Known:
     camera: ClipCamera
     #: (4, 2) of the screen in the last frame that showed it.
     corners: FloatArray | None = None
-    #: Some pixels of the last frame.
-    thumbnail: NDArray[np.float32] | None = None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FirstFrames:
-    """The first frames that show screen and camera."""
-
-    #: Where the screen is in the first of them, and its outline by all.
-    located: Located
-    outline: FirstOutline
-    frames: tuple[Frame, ...]
+    #: The last frame.
+    frame: Frame | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +67,7 @@ class Acquiring:
     """No frame has been received: the first ones wait until they agree."""
 
     known: Known
-    started: FirstFrames | None = None
+    frames: FirstFrames | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,6 +86,7 @@ class Lost:
 
 
 State = Acquiring | Tracking | Lost
+_Step = tuple[Tracking | Lost, list[FrameResult]]
 
 
 def begin(options: ReceiverOptions) -> State:
@@ -111,9 +102,9 @@ def step(state: State, frame: Frame) -> tuple[State, list[FrameResult]]:
 
 def finish(state: State) -> list[FrameResult]:
     """The results still held back."""
-    if not isinstance(state, Acquiring) or state.started is None:
+    if not isinstance(state, Acquiring) or state.frames is None:
         return state.known.ledger.finish()
-    after, results = _receive_first(state.known, state.started)
+    after, results = _receive_first(state.known, state.frames)
     return results + after.known.ledger.finish()
 
 
@@ -121,45 +112,25 @@ def finish(state: State) -> list[FrameResult]:
 
 
 def _acquire(state: Acquiring, frame: Frame) -> tuple[State, list[FrameResult]]:
-    """Take one of the first frames; they are received once they agree on an outline and, perhaps, on a clock."""
-    known, started = state.known, state.started
-    if started is None:
-        located = known.camera.locate(frame, Timer())
-        if isinstance(located, Failure):
-            after, results = _receive(Lost(known), frame, located)
-            return Acquiring(after.known), results
-        outline = FirstOutline(frame, located.outline.corners, known.camera.options, located.context)
-        started = FirstFrames(located, outline, (frame,))
-    else:
-        started = _with_frame(known, started, frame)
-    little, unsettled = shows_little(started.located.context), started.located.camera_error == np.inf
-    if unsettled:
-        min_frames = SETTINGS.frames_held_long if little else SETTINGS.frames_together
-    else:
-        min_frames = SETTINGS.frames_together if little else 1
-    enough = started.outline.settled and len(started.frames) >= min_frames
-    return _receive_first(known, started) if enough else (Acquiring(known, started), [])
+    """Take one of the first frames; they are received once they agree."""
+    known, before = state.known, state.frames
+    frames = before.with_frame(frame, known.camera) if before else FirstFrames.begin(frame, known.camera)
+    if isinstance(frames, Failure):
+        after, results = _receive(Lost(known), frame, frames)
+        return Acquiring(after.known), results
+    return _receive_first(known, frames) if frames.are_enough else (Acquiring(known, frames), [])
 
 
-def _with_frame(known: Known, started: FirstFrames, frame: Frame) -> FirstFrames:
-    """The first frames and one more; where each shows little or nothing, the surest of their cameras counts."""
-    started.outline.add(frame)
-    located = started.located
-    if located.camera_error == np.inf or (located.camera_error > 0 and shows_little(located.context)):
-        located = located.with_surer_camera(known.camera.locate(frame, Timer()))
-    return FirstFrames(located, started.outline, (*started.frames, frame))
-
-
-def _receive_first(known: Known, started: FirstFrames) -> tuple[State, list[FrameResult]]:
-    """Receive the first frames: they have agreed on an outline and, where each shows little, on a clock."""
-    located = started.located.moved_to(started.outline.corners)
-    if isinstance(located.found, Found) and located.found.best.context.frame is not started.frames[0]:
-        located = replace(located, found=None)
-    camera, located = known.camera.read_in_time(located, started.frames)
-    if len(started.frames) > 1 and shows_little(located.context):
-        located, known.ledger.start = camera.with_common_clock(located, started.frames)
-    after, results = _receive(Lost(replace(known, camera=camera)), started.frames[0], located)
-    for frame in started.frames[1:]:
+def _receive_first(known: Known, held: FirstFrames) -> _Step:
+    """Receive the first frames, once they have agreed on an outline and, where each shows little, on a clock."""
+    located = held.agreed()
+    if len(held.frames) > 1 and held.shows_little:
+        agreed = common_clock(held.frames, located.context, known.camera.options.screens)
+        if agreed is not None:
+            known.ledger.start, context = agreed
+            located = replace(located, context=context)
+    after, results = _receive(Lost(known), held.frames[0], located)
+    for frame in held.frames[1:]:
         after, more = _receive(after, frame)
         results += more
     return after, results
@@ -168,165 +139,135 @@ def _receive_first(known: Known, started: FirstFrames) -> tuple[State, list[Fram
 # -- one frame ---------------------------------------------------------------------------------------------------------
 
 
-def _receive(
-    state: Tracking | Lost, frame: Frame, located: Located | Failure | None = None
-) -> tuple[Tracking | Lost, list[FrameResult]]:
+def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | None = None) -> _Step:
     """Receive a frame by what is known, or like a photograph where that does not fit; `located` where it is."""
-    timer, ledger = Timer(), state.known.ledger
+    timer, ledger, before = Timer(), state.known.ledger, state.known.frame
     message = _NOMINAL_TIME if frame.nominal_time else ledger.message
     waiting = Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok", message=message))
-    doubled, known = _is_doubled(state.known, frame)
-    state = replace(state, known=known)
-    reason = _reason_to_skip(state, frame, doubled)
+    reason = _reason_to_skip(state, frame, before)
+    state = replace(state, known=replace(state.known, frame=frame))
     if reason is not None:
         counter, message = reason
-        waiting.result = replace(waiting.result, message=message)
-        waiting.skip(counter, 1)
+        waiting.skip(counter)
+        waiting.update(message=message)
         return state, ledger.add(waiting)
     view: View | Failure | None = _tracked_view(state, frame, timer)
     if isinstance(state, Tracking) and view is not None:
-        waiting.skip("tracking", 1)
-        state = Tracking(replace(known, corners=state.scene.corners), state.scene)
+        waiting.skip("tracking")
+        state = replace(state, known=replace(state.known, corners=state.scene.corners))
     else:
-        state, view, report = _receive_anew(state, frame, located, timer)
-        waiting.result = replace(waiting.result, denoiser=report)
-    camera = state.known.camera
-    if camera.message and not waiting.result.message:
-        waiting.result = replace(waiting.result, message=camera.message)
+        state, view, report = _receive_anew(state.known, frame, located, timer)
+        waiting.update(denoiser=report)
+    waiting.update(message=waiting.result.message or state.known.camera.message)
     if isinstance(view, Failure):
-        waiting.result = replace(waiting.result, status=view.status, message=view.message, timing_ms=timer.total())
+        waiting.update(status=view.status, message=view.message, timing_ms=timer.total())
         return state, ledger.add(waiting, scene_ends=True)
-    waiting.result = replace(
-        waiting.result,
+    waiting.update(
         **view.context.camera.result_fields,
         screen_profile=view.acquisition.screen.name,
         corners=state.known.corners,
     )
-    scene = state.scene if isinstance(state, Tracking) else None
-    results = ledger.enter(waiting, view, scene)
-    waiting.result = replace(waiting.result, timing_ms=timer.total())
+    results = ledger.enter(waiting, view, state.scene if isinstance(state, Tracking) else None)
+    waiting.update(timing_ms=timer.total())
     return state, results
 
 
-def _reason_to_skip(state: Tracking | Lost, frame: Frame, doubled: bool) -> tuple[str, str] | None:
+def _reason_to_skip(state: Tracking | Lost, frame: Frame, before: Frame | None) -> tuple[str, str] | None:
     """Counter and message of a frame that need not be received; None of others."""
-    if doubled:
+    ledger, options = state.known.ledger, state.known.camera.options
+    if "tracking" in options.skip and before is not None and _is_doubled(frame, before, state.known.corners):
         return "doubled_frames", _SAME
-    known = state.known
-    if (
-        isinstance(state, Tracking)
-        and known.camera.options.stop_when_certain
-        and known.ledger.has_certain_bursts(frame, state.scene)
-    ):
+    if options.stop_when_certain and isinstance(state, Tracking) and ledger.has_certain_bursts(frame, state.scene):
         return "certain_frames", "its bursts are certain from the frames before"
     return None
 
 
-def _is_doubled(known: Known, frame: Frame) -> tuple[bool, Known]:
-    """Whether a frame is the one before once more, as a change of the frame rate makes them: its time is wrong."""
-    if "tracking" not in known.camera.options.skip or known.corners is None:
-        return False, known
-    some = frame.pixels[:: SETTINGS.same_step, :: SETTINGS.same_step].astype(np.float32)
-    before, known = known.thumbnail, replace(known, thumbnail=some)
-    if before is None or before.shape != some.shape:
-        return False, known
-    assert known.corners is not None
-    (left, top), (right, bottom) = (known.corners[[0, 2]] / SETTINGS.same_step).astype(int).clip(0)
-    screen = np.s_[min(top, bottom) : max(top, bottom), min(left, right) : max(left, right)]
-    some, before = some[screen], before[screen]
-    if min(some.shape) < 2:
-        return False, known
-    # Stripes are elsewhere in every other frame.
+def _is_doubled(frame: Frame, before: Frame, corners: FloatArray | None) -> bool:
+    """Whether a frame is the one before once more, as a change of the frame rate makes them: its time is wrong.
+
+    Args:
+        frame: the frame.
+        before: the one before.
+        corners: (4, 2) of the screen there; stripes are elsewhere in every other frame.
+    """
+    if corners is None or before.pixels.shape != frame.pixels.shape:
+        return False
+    left, top = np.maximum(corners.min(axis=0), 0).astype(int)
+    right, bottom = np.maximum(corners.max(axis=0), 0).astype(int)
+    screen = np.s_[top : bottom : SETTINGS.same_step, left : right : SETTINGS.same_step]
+    pixels, earlier = (each.pixels[screen].astype(np.float32) for each in (frame, before))
+    if min(pixels.shape) < 2:
+        return False
+    contrast = float(np.abs(np.diff(pixels, axis=0)).mean())
+    changed = float(np.abs(pixels - earlier).mean())
     unit = (frame.white - frame.black) / 255
-    contrast = float(np.abs(np.diff(some, axis=0)).mean())
-    changed = float(np.abs(some - before).mean())
-    return contrast > SETTINGS.same_contrast * unit and changed < SETTINGS.same_share * contrast, known
+    return contrast > SETTINGS.same_contrast * unit and changed < SETTINGS.same_share * contrast
 
 
 def _tracked_view(state: Tracking | Lost, frame: Frame, timer: Timer) -> View | None:
     """The view of a frame by what is known; None where that does not fit."""
-    if not isinstance(state, Tracking) or not state.known.camera.fits(frame):
-        return None
     time, thorough = state.known.ledger.time, not state.known.ledger.holds_more
-    return None if time is None else state.scene.view(frame, time, thorough, timer)
+    if not isinstance(state, Tracking) or time is None or not state.known.camera.fits(frame):
+        return None
+    return state.scene.view(frame, time, thorough, timer)
 
 
 # -- a frame like a photograph -----------------------------------------------------------------------------------------
 
 
 def _receive_anew(
-    state: Tracking | Lost, frame: Frame, located: Located | Failure | None, timer: Timer
+    known: Known, frame: Frame, located: Located | Failure | None, timer: Timer
 ) -> tuple[Tracking | Lost, View | Failure, dict[str, Any] | None]:
     """Receive a frame like a photograph, only the camera taken from before.
 
     Returns:
         The state after it, its view, and what the auto-encoder reports.
     """
-    known, ledger = state.known, state.known.ledger
-    camera = known.camera.for_frame(frame)
+    ledger, camera = known.ledger, known.camera.of_frame(frame)
     located = located or camera.locate(frame, timer)
     if isinstance(located, Failure):
         return Lost(replace(known, camera=camera)), located, None
     ledger.certainty = located.outline.certainty
-    corners = located.outline.corners
-    camera = camera.found_with(located, frame)
-    assert camera.context is not None
-    context = replace(camera.context, frame=frame, corners=corners, timer=timer)
-    predicted = None if ledger.start is None else acquisition_at(ledger.start, context)
-    camera, settled = camera.settled(replace(located, context=context), predicted)
-    lost = Lost(replace(known, camera=camera, corners=corners))
-    if isinstance(settled, Failure):
-        return lost, settled, None
-    reception, denoised, report = _decoded(settled, known, timer)
-    camera, estimated = camera.estimated(settled.context, reception)
-    lost = replace(lost, known=replace(lost.known, camera=camera))
-    if estimated is not None:
-        settled = estimated
-        reception, denoised, report = _decoded(settled, lost.known, timer)
+    camera, acquired = camera.acquire(located, ledger.start, timer)
+    known = replace(known, camera=camera, corners=located.outline.corners)
+    if isinstance(acquired, Failure):
+        return Lost(known), acquired, None
+    options, acquisition = camera.options, acquired.acquisition
+    with timer("detect"):
+        reception = decode(acquisition, options.skip, acquired.initial)
+    with timer("denoise"):
+        reception, denoised, report = apply_autoencoder(acquisition, reception, options)
     if ledger.start is None and shows_steady_light(reception):
-        return lost, Failure("no_signal", STEADY_LIGHT), None
+        return Lost(known), Failure("no_signal", STEADY_LIGHT), None
     if assemble.all_dark(reception.snr):
-        message = "no light of the screen's columns is seen; something may be in front of it"
-        return lost, Failure("no_signal", message), None
+        return Lost(known), Failure("no_signal", _NOTHING_LIT), None
     view = View(
-        settled.context,
-        settled.acquisition,
+        acquired.context,
+        acquisition,
         _bursts_of(frame, reception),
         reception.model.exposure.isi_memory,
         frame.height,
         reception.snr,
         denoised,
     )
-    if not _can_track(settled, camera.options):
-        return lost, view, report
+    if not _can_track(acquired, options):
+        return Lost(known), view, report
     with timer("sampling"):
-        named = camera.options.corners is not None
-        scene = TrackedScreen(settled.context, settled.acquisition, reception.model.black_level, named)
+        scene = TrackedScreen(
+            acquired.context, acquisition, reception.model.black_level, named=options.corners is not None
+        )
         view.light, view.pose = scene.strips(frame), scene.pose
     scene.update(view, lambda: reception.clock.on_grid(reception.posteriors.lit))
-    return Tracking(lost.known, scene), view, report
+    return Tracking(known, scene), view, report
 
 
-def _decoded(settled: Settled, known: Known, timer: Timer) -> tuple[Reception, frozenset[int], dict[str, Any] | None]:
-    """What is received with a clock and camera, columns that the auto-encoder changed, and its report.
-
-    A reception that there is already needs no other.
-    """
-    options, acquisition, reception = known.camera.options, settled.acquisition, settled.reception
-    if reception is None:
-        with timer("detect"):
-            reception = decode(acquisition, options.skip, settled.initial)
-    with timer("denoise"):
-        return apply_autoencoder(acquisition, reception, options)
-
-
-def _can_track(settled: Settled, options: ReceiverOptions) -> bool:
+def _can_track(acquired: Acquired, options: ReceiverOptions) -> bool:
     """Whether a row of the picture is one instant, in the order of time."""
     return (
         "tracking" in options.skip
-        and settled.context.frame.mosaic is None
-        and settled.acquisition.profiles.sensor_row is None
-        and not settled.context.camera.reversed
+        and acquired.context.frame.mosaic is None
+        and acquired.acquisition.profiles.sensor_row is None
+        and not acquired.context.camera.reversed
     )
 
 

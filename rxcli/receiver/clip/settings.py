@@ -70,10 +70,8 @@ class ClipSettings:
     frames_held: int = 6
     frames_held_long: int = 24
     much_doubt: float = 0.03
-    #: Share of columns in doubt from which a first frame is not explained by the camera that is named, and below which
-    #: it is by another.
-    unlike_doubt: float = 0.85
-    like_doubt: float = 0.65
+    #: An estimated camera that gives this many times the evidence of packets replaces the named one.
+    unlike_evidence: float = 4.0
     #: Spacing of the pixels compared with the frame before; minimum change from row to row, grey levels of 255, and
     #: share of it by which a repeated frame may differ.
     same_step: int = 15

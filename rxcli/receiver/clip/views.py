@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.channel.known_picture import ColumnLight, Placement
@@ -56,6 +57,8 @@ class View:
     pose: Pose | None = None
     #: The columns' own light; None where the frame was received like a photograph.
     flat: ColumnLight | None = None
+    #: (B,) numbers of the frame's bursts, once known.
+    numbers: IntArray | None = None
 
 
 @dataclass(slots=True, eq=False)
@@ -64,11 +67,13 @@ class Waiting:
 
     result: FrameResult
     view: View | None = None
-    #: (B,) numbers of the frame's bursts, once known.
-    numbers: IntArray | None = None
 
-    def skip(self, name: str, count: int) -> None:
+    def update(self, **fields: Any) -> None:
+        """Set fields of the result."""
+        self.result = replace(self.result, **fields)
+
+    def skip(self, name: str, count: int = 1) -> None:
         """Count what was skipped in the result."""
         if count:
             skipped = self.result.skipped
-            self.result = replace(self.result, skipped={**skipped, name: skipped.get(name, 0) + count})
+            self.update(skipped={**skipped, name: skipped.get(name, 0) + count})
