@@ -14,7 +14,7 @@ from rxcli.receiver import plane
 from rxcli.receiver.context import FrameContext
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import Clock, FloatArray, IntArray, Outlines, RowProfiles
+from rxcli.types import Clock, IntArray, Outlines, RowProfiles
 
 #: Outlines of one frame that are kept.
 _MAX_OUTLINES = 8
@@ -59,11 +59,6 @@ class Acquisition:
         return replace(self, profiles=self.profiles.of_columns(part), clock=clock)
 
 
-def n_strips_of(corners: FloatArray, n_columns: int) -> int:
-    """Number of lateral strips of a column, from its width."""
-    return plane.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
-
-
 def outlines_of(context: FrameContext, n_columns: int) -> Outlines:
     """Outlines of the strips of a screen's columns, computed once for each place and lens."""
     frame, corners, lens = context.frame, context.corners, context.camera.lens
@@ -73,7 +68,7 @@ def outlines_of(context: FrameContext, n_columns: int) -> Outlines:
     if key not in known:
         if len(known) >= _MAX_OUTLINES:
             known.clear()
-        n_strips = n_strips_of(corners, n_columns)
+        n_strips = plane.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
         known[key] = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, lens)
     return known[key]
 
