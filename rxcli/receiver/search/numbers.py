@@ -24,7 +24,7 @@ _BESIDE = 2
 def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Proposer) -> list[Outline]:
     """The outlines, with lower log-odds where they leave out columns with packets.
 
-    On each side the columns that the nearest outline adds are read; those beyond are taken to show as much.
+    On each side the nearest outline is read; those beyond it leave out further columns of the chosen one.
 
     Args:
         best: the hypothesis that was chosen.
@@ -41,13 +41,14 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
             continue
         nearest = min(rivals, key=lambda index: abs(shifts[index]))
         moved = replace(best.hypothesis, outline=outlines[nearest], camera=best.context.camera)
-        profiles = sample_columns(proposer.context(moved), n_columns)
-        added = _outer_evidence(replace(acquisition, profiles=profiles), -shifts[nearest]) / abs(shifts[nearest])
+        rival, first = (
+            replace(acquisition, profiles=sample_columns(proposer.context(moved), n_columns)),
+            shifts[nearest],
+        )
+        gain = _outer_evidence(rival, -first) - _outer_evidence(acquisition, first)
         for index in rivals:
-            shift = shifts[index]
-            left_out = own_llr[:shift] if shift > 0 else own_llr[shift:]
-            gain = added * abs(shift) - float(left_out.sum())
-            log_odds = outlines[index].log_odds + SETTINGS.outer_weight * min(gain, 0.0)
+            further = own_llr[slice(*sorted((first, shifts[index])))]
+            log_odds = outlines[index].log_odds + SETTINGS.outer_weight * min(gain - float(further.sum()), 0.0)
             out[index] = replace(outlines[index], log_odds=log_odds)
     return out
 
