@@ -41,13 +41,11 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
             continue
         nearest = min(rivals, key=lambda index: abs(shifts[index]))
         moved = replace(best.hypothesis, outline=outlines[nearest], camera=best.context.camera)
-        rival, first = (
-            replace(acquisition, profiles=sample_columns(proposer.context(moved), n_columns)),
-            shifts[nearest],
-        )
-        gain = _outer_evidence(rival, -first) - _outer_evidence(acquisition, first)
+        profiles, n = sample_columns(proposer.context(moved), n_columns), shifts[nearest]
+        reread = replace(acquisition, profiles=profiles)
+        gain = _outer_evidence(reread, -n) - _outer_evidence(acquisition, n)
         for index in rivals:
-            further = own_llr[slice(*sorted((first, shifts[index])))]
+            further = own_llr[slice(*sorted((n, shifts[index])))]
             log_odds = outlines[index].log_odds + SETTINGS.outer_weight * min(gain - float(further.sum()), 0.0)
             out[index] = replace(outlines[index], log_odds=log_odds)
     return out
