@@ -90,10 +90,8 @@ def find_screens(
         layouts: that the screen may have.
         lens: of the picture, if known.
     """
-    if min(plane.width, plane.height) < SETTINGS.min_size_px:
-        return []
-    strips = read_strips(plane, lens)
-    if strips.lit.shape[1] < SETTINGS.min_strips:
+    strips = _strips_of(plane, lens)
+    if strips is None:
         return []
     narrow, wide = ([layout for layout in layouts if layout.is_narrow is many] for many in (True, False))
     screens = _screens_apart(strips, wide) if wide else []
@@ -106,6 +104,14 @@ def find_screens(
             return [_numbered(fine, grid, narrow)]
     grid = wide_grid(strips, wide[0].sigma) if wide else None
     return [] if grid is None else [_numbered(strips, grid, wide)]
+
+
+def _strips_of(plane: LightPlane, lens: Lens | None = None) -> Strips | None:
+    """Strips of a picture, or None if it is too small."""
+    if min(plane.width, plane.height) < SETTINGS.min_size_px:
+        return None
+    strips = read_strips(plane, lens)
+    return strips if strips.lit.shape[1] >= SETTINGS.min_strips else None
 
 
 def _screens_apart(strips: Strips, layouts: Sequence[ColumnLayout]) -> list[list[OutlineCandidate]]:
@@ -180,11 +186,13 @@ def wide_grid(strips: Strips, sigma: float) -> Grid | None:
 
 
 def shows_columns_plainly(plane: LightPlane, sigma: float) -> bool:
-    """Whether a picture shows wide columns beyond doubt."""
-    strips = read_strips(plane)
-    combs = _possible_combs(strips, sigma)
-    few = strips.blocks(slice(None, None, 4))
-    return bool(combs) and with_light(few, grid_of_comb(combs[0], strips), sigma).is_plain
+    """Whether a picture shows wide columns more plainly than by chance; cheaper than `find_outlines`."""
+    strips = _strips_of(plane)
+    if strips is None:
+        return False
+    some, combs = strips.blocks(slice(None, None, 2)), _possible_combs(strips, sigma)
+    grids = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs]
+    return any(_stands_out(some, grid, SETTINGS.min_plain_contrast) for grid in grids)
 
 
 def _score(grid: Grid) -> float:
@@ -203,10 +211,10 @@ def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
             own = few.part(part)
             grid = moved_by_waveforms(own, grid_of_comb(comb, strips), sigma, SETTINGS.narrow_steps)
             is_block = abs(grid.pitch_px - _BLOCK_PX) < _BLOCK_TOLERANCE_PX
-            if is_block or not _stands_out(own, with_light(own, grid, sigma), SETTINGS.min_narrow_contrast):
+            if is_block or not _stands_out(own, with_light(own, grid, sigma), SETTINGS.min_plain_contrast):
                 continue
             grid = with_light(some, _followed(some, grid, float(own.raw_x.mean()), sigma), sigma)
-            if _stands_out(some, grid, SETTINGS.min_narrow_contrast):
+            if _stands_out(some, grid, SETTINGS.min_plain_contrast):
                 return grid
     return None
 
