@@ -2,7 +2,8 @@
 
 Texture is the light of a cell of pixels over the mean of its neighbours along the row, which hardly shows stripes; the
 mean texture of the frames so far is known in the screen's coordinates (u, v). In a frame the four corners are moved by
-Gauss-Newton steps, on coarse cells and then on fine ones, until the frame's texture agrees with the known one. What
+Gauss-Newton steps, on coarse cells and then on the fine ones of steepest texture, until the frame's texture agrees with
+the known one. What
 remains of the stripes differs from column to column, so the scatter of the screen's parts gives the covariance of the
 corners (a sandwich estimate).
 
@@ -14,7 +15,6 @@ too, and a row remains one instant. See Lucas and Kanade 1981.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen import geometry
-from rxcli.types import Float32Array, FloatArray, Frame, Lens
+from rxcli.types import Float32Array, FloatArray, Frame, IntArray, Lens
 
 #: Ratio of a screen's width to its height.
 _ASPECT = 16 / 9
@@ -32,9 +32,13 @@ _ASPECT = 16 / 9
 #: divide the cells and the coarse cells.
 _CELLS, _PARTS = (108, 360), (6, 18)
 #: Cells of a coarse cell down and across, and smoothing of the coarse texture in such cells.
-_COARSE, _COARSE_BLUR = (2, 4), 0.8
+_COARSE, _COARSE_BLUR = np.array([2, 4]), 0.8
+#: Fine cells along a row of which the most informative one is compared; and rows that are read of a cell, at least.
+_COMPARED_OF, _ROWS_READ = 2, 3
+#: Screen sizes around the expected screen that are searched.
+_REACH = 0.06
 #: Share of the screen's size beyond its sides that belongs to the texture: the sides help to locate it.
-_MARGIN = 0.01
+_MARGIN = 0.03
 #: Cells across over whose mean light is texture.
 _NEIGHBOURS = 7
 #: Standard deviation of a cell's light as a share of white, and of the stripes that remain in the texture.
@@ -43,8 +47,9 @@ _CELL_NOISE, _STRIPE_NOISE = 0.009, 0.08
 _DARK_PERCENT = 8.0
 #: Factor by which a gradient of the texture must exceed its expected noise; cells around over which both are averaged.
 _ABOVE_NOISE, _LOCAL_CELLS = 1.3, 15
-#: Maximum iterations of a fit, and squared standard deviations of a step after which it ends.
-_ITERATIONS, _CONVERGED = 5, 0.3
+#: Maximum iterations of a fit, and motion of the corners, cells, after which it ends. Fine detail makes a whole
+#: Gauss-Newton step too long.
+_ITERATIONS, _CONVERGED, _STEP_SHARE = 8, 0.1, 0.7
 #: Standard deviations beyond which a cell is an outlier: a hand, a reflection.
 _OUTLIER = 2.5
 #: Standard deviations of a prediction in screen sizes: shift, affine modes, perspective modes.
@@ -98,15 +103,28 @@ class Registration:
 
 
 @dataclass(frozen=True, slots=True)
-class _Known:
-    """The known texture (V, U) on cells of one size."""
+class _Texture:
+    """Texture of a frame around the screen."""
 
+    #: (Y, X, 2) texture, and its weight 0..1.
+    values: Float32Array
+    #: Pixel x and y of the first cell's corner, and pixels of a cell across and down.
+    origin: FloatArray
+    cell: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """The known texture of P parts of the screen, on the K most informative cells of each."""
+
+    #: Cells of the whole screen down and across, and (P, K) indices of the compared ones.
+    shape: tuple[int, int]
+    cells: IntArray
+    #: (P, K) texture, and its reliability, 0..1.
     value: Float32Array
-    #: Reliability of the texture, 0..1.
     trust: Float32Array
-    #: (2, V, U) gradient of the texture along u and v, per screen.
+    #: (2, P, K) gradient of the texture along u and v, per screen; and (3, P, K) its products uu, uv and vv.
     gradient: Float32Array
-    #: (3, V, U) its products uu, uv and vv.
     products: Float32Array
 
 
@@ -123,25 +141,25 @@ class ScreenTexture:
         self._lens = lens if lens is not None and not lens.corrected else None
         sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
         height, width = (sides[1] + sides[3]) / 2, (sides[0] + sides[2]) / 2
-        #: Pixels of a cell down and across.
-        self._cell = max(round(height / _CELLS[0]), 1), max(round(width / _CELLS[1]), 1)
+        #: Pixels of a cell across and down.
+        self._cell = max(round(width / _CELLS[1]), 1), max(round(height / _CELLS[0]), 1)
         self._plane = self._before = self._undistorted(corners)
         self._n_frames = 0
         #: Value and weight of the known texture, and the same on coarse and on fine cells; None if to be recomputed.
         self._mean: Float32Array = np.zeros((*_CELLS, 2), np.float32)
         self._known: tuple[_Known, _Known] | None = None
-        self._read_last: tuple[Frame, Float32Array] | None = None
+        self._read_last: tuple[Frame, _Texture] | None = None
         self.learn(frame, Registration(corners, np.zeros((8, 8)), 1.0))
 
     def find(self, frame: Frame) -> Registration:
         """Register the screen in the next frame."""
         if self._known is None:
-            self._known = _known_of(_coarser(self._mean), _COARSE[0] * _COARSE[1]), _known_of(self._mean, 1)
-        texture = self._texture_of(frame)
+            self._known = _known_of(_coarser(self._mean), 1), _known_of(self._mean, _COMPARED_OF)
         plane = expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
-        for cells, known, size in zip((_coarser(texture), texture), self._known, (_COARSE, (1, 1)), strict=True):
-            cell = [mine * n for mine, n in zip(self._cell, size, strict=True)]
-            plane, covariance, correlation = self._fit(cells, known, cell, plane, expected)
+        fine = self._texture_of(frame)
+        coarse = _Texture(_coarser(fine.values), fine.origin, fine.cell * _COARSE[::-1])
+        for texture, known in zip((coarse, fine), self._known, strict=True):
+            plane, covariance, correlation = self._fit(texture, known, plane, expected)
         return Registration(self._distorted(plane), covariance, correlation)
 
     def with_outline(self, found: Registration, outline: FloatArray, sd: float = _OUTLINE_SD) -> Registration:
@@ -160,65 +178,70 @@ class ScreenTexture:
         if self._n_frames > _FIRST_FRAMES and self._n_frames % _LEARN_EVERY:
             return
         self._known = None
-        value, weight = np.moveaxis(self._read(self._texture_of(frame), self._plane, self._cell, _CELLS), 2, 0)
+        x, y = self._places(self._texture_of(frame), self._plane, _CELLS)
+        value, weight = _read(self._texture_of(frame), x, y)
         mean, before = np.moveaxis(self._mean, 2, 0)
         total = before + weight
         mean += (value - mean) * (weight / np.maximum(total, np.float32(TINY)))
         np.minimum(total, np.float32(_MAX_WEIGHT), out=before)
 
-    def _texture_of(self, frame: Frame) -> Float32Array:
-        """The texture of a frame; that of the last one is cached."""
+    def _texture_of(self, frame: Frame) -> _Texture:
+        """The texture of a frame around the last place of the screen and in its middle; that of one frame is cached."""
         if self._read_last is None or self._read_last[0] is not frame:
-            self._read_last = frame, _texture_of(frame, *self._cell)
+            corners = self._distorted(self._plane)
+            reach = _REACH * _size(corners)
+            size = np.array([frame.width, frame.height])
+            first = (corners.min(axis=0) - reach).clip(0, size // 4).astype(int)
+            last = (corners.max(axis=0) + reach).clip(size - size // 4, size).astype(int)
+            self._read_last = frame, _texture_of(frame, first, last, *self._cell)
         return self._read_last[1]
 
     def _fit(
-        self, texture: Float32Array, known: _Known, cell: Sequence[int], plane: FloatArray, expected: FloatArray
+        self, texture: _Texture, known: _Known, plane: FloatArray, expected: FloatArray
     ) -> tuple[FloatArray, FloatArray, float]:
         """Corners (4, 2) on the undistorted picture, their covariance (8, 8), and the textures' correlation.
 
         Args:
             texture: of the frame.
             known: of the screen, on cells of the same size.
-            cell: pixels of a cell down and across.
             plane: corners to begin with.
             expected: corners as predicted.
         """
         prior, shares = _prior_of_one() / _size(plane) ** 2, _corner_shares()
+        # From the corners' motion along u and v to pixels, with the screen approximated by a parallelogram.
+        side_u, side_v = plane[1] - plane[0] + plane[2] - plane[3], plane[3] - plane[0] + plane[2] - plane[1]
+        to_pixels = np.kron(np.eye(4), np.linalg.inv(np.stack([side_u, side_v], axis=1) / 2))[_BY_AXIS]
         for _ in range(_ITERATIONS):
-            value, weight = np.moveaxis(self._read(texture, plane, cell, known.value.shape), 2, 0)
+            x, y = self._places(texture, plane, known.shape)
+            value, weight = _read(texture, x.take(known.cells), y.take(known.cells))
             error, weight = known.value - value, weight * known.trust
-            variance = max(float((weight * error**2).sum() / max(weight.sum(), TINY)), TINY)
-            weight /= 1 + error**2 / np.float32(_OUTLIER**2 * variance)
-            # From the corners' motion along u and v to pixels, with the screen approximated by a parallelogram.
-            side_u, side_v = plane[1] - plane[0] + plane[2] - plane[3], plane[3] - plane[0] + plane[2] - plane[1]
-            to_pixels = np.kron(np.eye(4), np.linalg.inv(np.stack([side_u, side_v], axis=1) / 2))[_BY_AXIS]
-            sums = _sums_of_parts(np.concatenate([known.gradient * (weight * error), known.products * weight]))
-            uu, uv, vv = (shares * products @ shares.T for products in sums[2:])
+            squared = error * error
+            variance = max(float(np.vdot(weight, squared)) / max(float(weight.sum()), TINY), TINY)
+            weight /= 1 + squared / np.float32(_OUTLIER**2 * variance)
+            uu, uv, vv = (shares * part @ shares.T for part in np.einsum("npk,pk->np", known.products, weight))
             normal = to_pixels.T @ np.block([[uu, uv], [uv, vv]]) @ to_pixels
-            scores = (sums[:2, None] * shares).reshape(8, -1).T @ to_pixels
+            along = np.einsum("npk,pk->np", known.gradient, weight * error)
+            scores = (along[:, None] * shares).reshape(8, -1).T @ to_pixels
             # The normal matrix is scaled to the information that the scatter of the parts leaves.
             scale = max(float(np.square(scores).sum() / max(np.trace(normal), TINY)), TINY)
             slope = scores.sum(axis=0) / scale + prior @ (expected - plane).ravel()
-            step = np.linalg.solve(normal / scale + prior, slope)
+            step = np.linalg.solve(normal / scale + prior, slope) * _STEP_SHARE
             plane = plane + step.reshape(4, 2)
-            if step @ slope < _CONVERGED:
+            if np.abs(step.reshape(4, 2) / texture.cell).max() < _CONVERGED:
                 break
         power = float((weight * known.value**2).sum() * (weight * value**2).sum())
         correlation = float((weight * known.value * value).sum()) / max(power, TINY**2) ** 0.5
         return plane, _sandwich(normal, scores, variance, prior), correlation
 
-    def _read(
-        self, texture: Float32Array, plane: FloatArray, cell: Sequence[int], shape: tuple[int, ...]
-    ) -> Float32Array:
-        """(V, U, 2) of a frame's texture at positions of the screen, with the screen at `plane`; 0 outside."""
-        import cv2
-
+    def _places(
+        self, texture: _Texture, plane: FloatArray, shape: tuple[int, int]
+    ) -> tuple[Float32Array, Float32Array]:
+        """x and y of the screen's cells (V, U), in cells of a frame's texture, with the screen at `plane`."""
         knots, down, across = _positions(*shape)
         projected = knots @ geometry.homography(plane).T
         pixels = self._distorted(projected[:, :2] / projected[:, 2:])
-        x, y = ((pixels + 0.5) / cell[::-1] - 0.5).T.reshape(2, *_KNOTS).astype(np.float32)
-        return np.asarray(cv2.remap(texture, down @ x @ across, down @ y @ across, cv2.INTER_LINEAR))
+        x, y = ((pixels + 0.5 - texture.origin) / texture.cell - 0.5).T.reshape(2, *_KNOTS).astype(np.float32)
+        return np.asarray(down @ x @ across, np.float32), np.asarray(down @ y @ across, np.float32)
 
     def _distorted(self, points: FloatArray) -> FloatArray:
         return points if self._lens is None else geometry.distort(points, self._lens)
@@ -227,14 +250,26 @@ class ScreenTexture:
         return corners.copy() if self._lens is None else geometry.undistort(corners, self._lens)
 
 
-def _texture_of(frame: Frame, cell_y: int, cell_x: int) -> Float32Array:
-    """(Y, X, 2) texture of a whole frame, and its weight 0..1."""
+def _read(texture: _Texture, x: Float32Array, y: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """Texture at places of any shape (n, m), and its weight; 0 outside."""
     import cv2
 
-    n_y, n_x = frame.height // cell_y, frame.width // cell_x
-    pixels: NDArray[Any] = frame.pixels[: n_y * cell_y, : n_x * cell_x]
-    sums = np.add.reduce(pixels.reshape(n_y, cell_y, -1), axis=1, dtype=np.uint32).astype(np.float32)
-    coded = cv2.resize(sums, (n_x, n_y), interpolation=cv2.INTER_AREA) / np.float32(cell_y)
+    read = np.asarray(cv2.remap(texture.values, x, y, cv2.INTER_LINEAR))
+    return read[..., 0], read[..., 1]
+
+
+def _texture_of(frame: Frame, first: IntArray, last: IntArray, cell_x: int, cell_y: int) -> _Texture:
+    """The texture of a part of a frame, from its `first` to its `last` x and y."""
+    import cv2
+
+    (left, top), (n_x, n_y) = first.tolist(), ((last - first) // (cell_x, cell_y)).tolist()
+    pixels: NDArray[Any] = frame.pixels[top : top + n_y * cell_y, left : left + n_x * cell_x]
+    every = max(cell_y // _ROWS_READ, 1)
+    rows = range((cell_y - 1) % every // 2, cell_y, every)
+    sums = np.zeros((n_y, n_x * cell_x), np.float32)
+    for row in rows:
+        sums += pixels[row::cell_y]
+    coded = cv2.resize(sums, (n_x, n_y), interpolation=cv2.INTER_AREA) / np.float32(len(rows))
     coded = np.clip((coded - np.float32(frame.black)) / np.float32(frame.white - frame.black), 0, 1)
     # The tone curve is undone roughly: any of the usual ones is accurate enough.
     light = coded if frame.linear else coded * coded
@@ -243,14 +278,15 @@ def _texture_of(frame: Frame, cell_y: int, cell_x: int) -> Float32Array:
     middle = mean[n_y // 4 : n_y - n_y // 4 : 2, ::2]
     lit = np.maximum(mean - np.percentile(middle, _DARK_PERCENT).astype(np.float32), np.float32(1e-4))
     noise = np.float32(_CELL_NOISE / _STRIPE_NOISE) * (np.float32(1) if frame.linear else np.maximum(coded, 0.03)) / lit
-    return np.stack([np.clip((light - mean) / lit, -1, 1), 1 / (1 + noise * noise)], axis=2)
+    values = np.stack([np.clip((light - mean) / lit, -1, 1), 1 / (1 + noise * noise)], axis=2)
+    return _Texture(values, first.astype(np.float64), np.array([cell_x, cell_y], np.float64))
 
 
 def _coarser(texture: Float32Array) -> Float32Array:
     """Weighted means (Y, X, 2) over coarse cells; incomplete cells at the right and at the bottom are dropped."""
     import cv2
 
-    n_y, n_x = (n // cells for n, cells in zip(texture.shape, _COARSE, strict=False))
+    n_y, n_x = np.floor_divide(texture.shape[:2], _COARSE).tolist()
     fine = texture[: n_y * _COARSE[0], : n_x * _COARSE[1]].copy()
     fine[..., 0] *= fine[..., 1]
     coarse = cv2.GaussianBlur(cv2.resize(fine, (n_x, n_y), interpolation=cv2.INTER_AREA), (0, 0), _COARSE_BLUR)
@@ -258,8 +294,13 @@ def _coarser(texture: Float32Array) -> Float32Array:
     return np.asarray(coarse)
 
 
-def _known_of(texture: Float32Array, n_cells: int) -> _Known:
-    """The texture (V, U, 2), with gradients shrunk by their noise; `n_cells` were averaged for each of its cells."""
+def _known_of(texture: Float32Array, of_cells: int) -> _Known:
+    """The known texture of the whole screen, to be compared; gradients are shrunk by their noise.
+
+    Args:
+        texture: (V, U, 2).
+        of_cells: one of so many cells along a row is compared.
+    """
     import cv2
 
     value, weight = (np.ascontiguousarray(part) for part in np.moveaxis(texture, 2, 0))
@@ -268,14 +309,20 @@ def _known_of(texture: Float32Array, n_cells: int) -> _Known:
         return np.asarray(cv2.boxFilter(values, -1, (_LOCAL_CELLS, _LOCAL_CELLS)))
 
     total = np.maximum(around(weight), np.float32(TINY))
-    min_power = np.float32(_ABOVE_NOISE * 0.5 * _STRIPE_NOISE**2 / n_cells) / total
-    along = np.stack(np.gradient(value)[::-1])
-    for change, n in zip(along, value.shape[::-1], strict=True):
-        power = around(change * change * weight) / total
-        change *= np.maximum(1 - min_power / np.maximum(power, np.float32(TINY)), 0) * np.float32(n / (1 + 2 * _MARGIN))
-    gradient = np.asarray(along, np.float32)
+    noise_power = np.float32(_ABOVE_NOISE * 0.5 * _STRIPE_NOISE**2 * value.size / np.prod(_CELLS)) / total
+    gradient = np.stack(np.gradient(value)[::-1])
+    for change, n in zip(gradient, value.shape[::-1], strict=True):
+        power = np.maximum(around(change * change * weight) / total, np.float32(TINY))
+        change *= np.maximum(1 - noise_power / power, 0) * np.float32(n / (1 + 2 * _MARGIN))
+    trust = weight / (weight + 1)
+    along_u, along_v = (trust * change * change for change in gradient)
+    information = along_u / (along_u.mean() + np.float32(TINY)) + along_v / (along_v.mean() + np.float32(TINY))
+    cells = np.arange(0, value.size, of_cells) + information.reshape(-1, of_cells).argmax(axis=1)
+    down, across = _PARTS
+    cells = cells.reshape(down, len(value) // down, across, -1).swapaxes(1, 2).reshape(down * across, -1)
+    gradient = gradient.reshape(2, -1).take(cells, axis=1)
     products = np.stack([gradient[0] ** 2, gradient[0] * gradient[1], gradient[1] ** 2])
-    return _Known(value, np.asarray(weight / (weight + 1), np.float32), gradient, products)
+    return _Known(value.shape, cells, value.take(cells), trust.take(cells), gradient, products)
 
 
 @cache
@@ -303,14 +350,6 @@ def _positions(n_v: int, n_u: int) -> tuple[FloatArray, Float32Array, Float32Arr
         for n, at in ((n_v, knots_v), (n_u, knots_u))
     )
     return knots, down, np.ascontiguousarray(across.T)
-
-
-def _sums_of_parts(values: Float32Array) -> FloatArray:
-    """(n, parts) sums of values (n, V, U) over the parts of the screen."""
-    n, n_v, n_u = values.shape
-    down, across = _PARTS
-    parts = values.reshape(n, down, n_v // down, n_u).sum(axis=2).reshape(n, down, across, n_u // across).sum(axis=3)
-    return np.asarray(parts.reshape(n, -1), np.float64)
 
 
 def _sandwich(normal: FloatArray, scores: FloatArray, variance: float, prior: FloatArray) -> FloatArray:
