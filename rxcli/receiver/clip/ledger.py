@@ -119,11 +119,6 @@ class Ledger:
         self._n_held = self._n_first
 
     @property
-    def holds_more(self) -> bool:
-        """Whether further frames are held back, because compression has taken much of the first ones."""
-        return self._n_held == SETTINGS.frames_held_long
-
-    @property
     def time(self) -> tracking.LinkTime | None:
         """The link's time; None before the first frame."""
         return self._link.time if self._link is not None else None

@@ -206,10 +206,10 @@ def _is_doubled(frame: Frame, before: Frame, corners: FloatArray | None) -> bool
 
 def _tracked_view(state: Tracking | Lost, frame: Frame, timer: Timer) -> View | None:
     """The view of a frame by what is known; None where that does not fit."""
-    time, thorough = state.known.ledger.time, not state.known.ledger.holds_more
+    time = state.known.ledger.time
     if not isinstance(state, Tracking) or time is None or not state.known.camera.fits(frame):
         return None
-    return state.scene.view(frame, time, thorough, timer)
+    return state.scene.view(frame, time, timer)
 
 
 # -- a frame like a photograph -----------------------------------------------------------------------------------------

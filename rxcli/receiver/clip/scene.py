@@ -179,7 +179,7 @@ class TrackedScreen:
 
     # -- a frame ------------------------------------------------------------------------------------------------
 
-    def view(self, frame: Frame, time: tracking.LinkTime, thorough: bool, timer: Timer) -> View | None:
+    def view(self, frame: Frame, time: tracking.LinkTime, timer: Timer) -> View | None:
         """A frame by what is known; None where that does not fit.
 
         A screen that rests is looked for now and then: had it moved, the picture would not fit as it did.
@@ -187,7 +187,6 @@ class TrackedScreen:
         Args:
             frame: taken with the same camera as those before.
             time: the link's time.
-            thorough: False where it is enough to measure a faded frame roughly, for it will be measured again.
             timer: time is counted there.
         """
         if self.last is None:
@@ -195,17 +194,15 @@ class TrackedScreen:
         self._n_unlooked += 1
         rests = self._n_rested >= SETTINGS.still_looks and self._n_updates >= SETTINGS.first_updates
         if rests and self._n_unlooked < SETTINGS.look_every:
-            view = self._view(frame, self.last, time, SETTINGS.rest_misfit, thorough, timer)
+            view = self._view(frame, self.last, time, SETTINGS.rest_misfit, timer)
             if view is not None:
                 return view
         with timer("geometry"):
             if not self._follow(frame):
                 return None
-        return self._view(frame, self.last, time, SETTINGS.misfit, thorough, timer)
+        return self._view(frame, self.last, time, SETTINGS.misfit, timer)
 
-    def _view(
-        self, frame: Frame, last: View, time: tracking.LinkTime, max_misfit: float, thorough: bool, timer: Timer
-    ) -> View | None:
+    def _view(self, frame: Frame, last: View, time: tracking.LinkTime, max_misfit: float, timer: Timer) -> View | None:
         """A frame, the screen being where it is thought to be."""
         with timer("sampling"):
             light, pose = self.strips(frame), self.pose
@@ -217,7 +214,7 @@ class TrackedScreen:
             if clock is None:
                 return None
         with timer("detect"):
-            refined = self._refined(picture, pose.rows, light, flat, clock, last.isi_memory, max_misfit, thorough)
+            refined = self._refined(picture, pose.rows, light, flat, clock, last.isi_memory, max_misfit)
             if refined is None:
                 return None
             flat, clock, positions, likelihoods = refined
@@ -244,7 +241,6 @@ class TrackedScreen:
         clock: Clock,
         isi_memory: int,
         max_misfit: float,
-        thorough: bool,
         known: Float32Array | None = None,
     ) -> tuple[known_picture.ColumnLight, Clock, FloatArray, SlotLikelihoods] | None:
         """Clock, response and noise put right by a first decision slot by slot; then positions and likelihoods.
@@ -260,7 +256,7 @@ class TrackedScreen:
                 break
             clock = _retimed(clock, rows, fit)
             positions = known_picture.row_positions(rows, clock)
-        if self._n_updates < SETTINGS.few_updates or (thorough and fit.response.centre < SETTINGS.faded):
+        if fit.response.centre < SETTINGS.faded:
             expected = known_picture.expected_light(lit, positions, exposure_slots, isi_memory, fit.response)
             flat = picture.solve_again(light, expected.light, clock.rows_per_slot)
             fit = known_picture.fit_response(flat, slots)
@@ -417,7 +413,7 @@ class TrackedScreen:
         clock, rows, most = view.bursts.clock, view.pose.rows, SETTINGS.misfit
         if known_picture.header_contrast(flat, known_picture.row_positions(rows, clock), clock) < SETTINGS.min_header:
             return
-        refined = self._refined(picture, rows, view.light, flat, clock, view.isi_memory, most, True, known)
+        refined = self._refined(picture, rows, view.light, flat, clock, view.isi_memory, most, known)
         if refined is not None:
             burst = view.bursts.clock.burst
             view.flat, clock, _, found = refined

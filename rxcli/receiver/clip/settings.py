@@ -37,8 +37,6 @@ class ClipSettings:
     #: Frames from which the picture is learned one by one, and how often from then on.
     first_updates: int = 12
     update_every: int = 6
-    #: Number of first frames with a poorly known picture, so that strips are compared with their expected light.
-    few_updates: int = 4
     #: Columns decided worse than this many times the foreseen variance do not fit what is known; and of a screen
     #: that is taken to rest: while it does 0.8 to 1.3 times, 2 pixels away 2 times and more.
     misfit: float = 40.0
@@ -96,7 +94,7 @@ class ClipSettings:
 
     #: Corners of two searches that differ by less than this, in screen widths, agree; searches where they do not.
     outlines_agree: float = 0.003
-    max_searches: int = 5
+    max_searches: int = 3
 
     #: A frame that shows fewer packets than this finds its clock with others; one that shows more does better alone.
     few_packets: float = 1.05
