@@ -139,9 +139,13 @@ def _sums(pixels: NDArray[Any], cell_px: int) -> NDArray[np.uint16]:
     sums = np.empty((words.shape[0], words.shape[1] // n), np.uint16)
     for top in range(0, words.shape[0], _ROWS_AT_A_TIME):
         some = words[top : top + _ROWS_AT_A_TIME]
-        pairs = (some & even) + ((some >> word(8)) & even)
-        cells = pairs[:, ::n].copy()
+        pairs, odd = some & even, some >> word(8)
+        odd &= even
+        pairs += odd
+        cells = pairs[:, ::n]
         for place in range(1, n):
             cells += pairs[:, place::n]
-        sums[top : top + _ROWS_AT_A_TIME] = (cells * add) >> word(8 * size - 16)
+        cells *= add
+        cells >>= word(8 * size - 16)
+        sums[top : top + _ROWS_AT_A_TIME] = cells
     return sums

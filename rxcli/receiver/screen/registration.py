@@ -38,7 +38,7 @@ _COMPARED_OF, _ROWS_READ = 2, 3
 #: Screen sizes around the expected screen that are searched.
 _REACH = 0.06
 #: Share of the screen's size beyond its sides that belongs to the texture: the sides help to locate it.
-_MARGIN = 0.03
+_MARGIN = 0.02
 #: Cells across over whose mean light is texture.
 _NEIGHBOURS = 7
 #: Standard deviation of a cell's light as a share of white, and of the stripes that remain in the texture.
@@ -69,8 +69,6 @@ _PERSISTENCE = 0.7
 _FIRST_FRAMES, _LEARN_EVERY = 10, 4
 #: Maximum weight of the earlier frames in the texture, in frames.
 _MAX_WEIGHT = 40.0
-#: From x and y of each corner in turn to all x, then all y.
-_BY_AXIS = np.array([0, 2, 4, 6, 1, 3, 5, 7])
 #: Points down and across through which the screen is projected.
 _KNOTS = (9, 17)
 
@@ -207,10 +205,11 @@ class ScreenTexture:
             plane: corners to begin with.
             expected: corners as predicted.
         """
-        prior, shares = _prior_of_one() / _size(plane) ** 2, _corner_shares()
+        prior, (shares, pairs) = _prior_of_one() / _size(plane) ** 2, _corner_shares()
         # From the corners' motion along u and v to pixels, with the screen approximated by a parallelogram.
         side_u, side_v = plane[1] - plane[0] + plane[2] - plane[3], plane[3] - plane[0] + plane[2] - plane[1]
-        to_pixels = np.kron(np.eye(4), np.linalg.inv(np.stack([side_u, side_v], axis=1) / 2))[_BY_AXIS]
+        inverse = np.linalg.inv(np.stack([side_u, side_v], axis=1) / 2)
+        to_pixels = (np.eye(4)[:, :, None] * inverse[:, None, None]).reshape(8, 8)
         for _ in range(_ITERATIONS):
             x, y = self._places(texture, plane, known.shape)
             value, weight = _read(texture, x.take(known.cells), y.take(known.cells))
@@ -218,8 +217,9 @@ class ScreenTexture:
             squared = error * error
             variance = max(float(np.vdot(weight, squared)) / max(float(weight.sum()), TINY), TINY)
             weight /= 1 + squared / np.float32(_OUTLIER**2 * variance)
-            uu, uv, vv = (shares * part @ shares.T for part in np.einsum("npk,pk->np", known.products, weight))
-            normal = to_pixels.T @ np.block([[uu, uv], [uv, vv]]) @ to_pixels
+            products = np.einsum("npk,pk->np", known.products, weight)[[0, 1, 1, 2]]
+            along_corners = (products @ pairs).reshape(2, 2, 4, 4).swapaxes(1, 2).reshape(8, 8)
+            normal = to_pixels.T @ along_corners @ to_pixels
             along = np.einsum("npk,pk->np", known.gradient, weight * error)
             scores = (along[:, None] * shares).reshape(8, -1).T @ to_pixels
             # The normal matrix is scaled to the information that the scatter of the parts leaves.
@@ -326,12 +326,12 @@ def _known_of(texture: Float32Array, of_cells: int) -> _Known:
 
 
 @cache
-def _corner_shares() -> FloatArray:
-    """(4, parts) share of each corner's motion in that of the middle of every part of the screen."""
+def _corner_shares() -> tuple[FloatArray, FloatArray]:
+    """(4, P) share of each corner's motion in that of the middle of every part of the screen; (P, 16) their products."""
     v, u = (_fractions(n) for n in _PARTS)
-    return np.stack(
-        [np.outer(down, across).ravel() for down, across in ((1 - v, 1 - u), (1 - v, u), (v, u), (v, 1 - u))]
-    )
+    corners = (1 - v, 1 - u), (1 - v, u), (v, u), (v, 1 - u)
+    shares = np.stack([np.outer(down, across).ravel() for down, across in corners])
+    return shares, (shares[:, None] * shares).reshape(16, -1).T
 
 
 def _fractions(n: int) -> FloatArray:
