@@ -327,7 +327,7 @@ def _known_of(texture: Float32Array, of_cells: int) -> _Known:
 
 @cache
 def _corner_shares() -> tuple[FloatArray, FloatArray]:
-    """(4, P) share of each corner's motion in that of the middle of every part of the screen; (P, 16) their products."""
+    """(4, P) share of each corner's motion in that of the middle of every part; (P, 16) products of these shares."""
     v, u = (_fractions(n) for n in _PARTS)
     corners = (1 - v, 1 - u), (1 - v, u), (v, u), (v, 1 - u)
     shares = np.stack([np.outer(down, across).ravel() for down, across in corners])

@@ -32,8 +32,8 @@ class _System:
     #: (C, S, R): gain of a strip's light.
     gain: Float32Array
     diagonal: Float32Array
-    next: Float32Array
-    next_but_one: Float32Array
+    #: (C, 2, R): the next column's part in an equation, and that of the next but one.
+    bands: Float32Array
     precision: Float32Array
 
 
@@ -86,7 +86,7 @@ class KnownPicture:
         self._sums: Float32Array = np.zeros((4, *inside.shape), np.float32)
         self._system: _System | None = None
         self._of_one: Float32Array | None = None
-        #: Cached picture and relative variance; None after a change.
+        #: Cached picture and variance of its light; None after a change.
         self._made: tuple[Float32Array, Float32Array] | None = None
         #: Last requested placement, and the picture there.
         self._placed: tuple[Placement, KnownPicture] | None = None
@@ -106,8 +106,8 @@ class KnownPicture:
 
     def _moved(self, placement: Placement) -> KnownPicture:
         moved = copy(self)
-        picture, error = (_resampled(values, placement.picture_row, beyond=False) for values in self.picture())
-        moved._made = picture, error
+        picture, variance = (_resampled(values, placement.picture_row, beyond=False) for values in self.picture())
+        moved._made = picture, variance
         moved._inside = placement.inside.astype(np.float32)
         moved._system = moved._of_one = moved._placed = None
         return moved
@@ -231,7 +231,7 @@ class KnownPicture:
         return np.asarray(tempered, np.float32)
 
     def picture(self) -> tuple[Float32Array, Float32Array]:
-        """The picture and its relative variance, (C, S, R) each."""
+        """The picture, and the variance of its light where half of the slots are lit; (C, S, R) each."""
         if self._made is None:
             self._made = self._make()
         return self._made
@@ -252,16 +252,12 @@ class KnownPicture:
         error += np.float32(SETTINGS.row_error) * observed
         error /= total * total
         error += np.float32(SETTINGS.min_error**2)
-        return picture, error
+        return picture, self._noise.through_picture(picture, picture * picture * error, np.full(1, 0.5, np.float32))
 
     def _factor(self, measured: Float32Array | None = None) -> _System:
         """Factor the normal equations A m = b of every row, A symmetric with two bands: A = L D L', and diag(A^-1)."""
-        picture, error = self.picture()
-        # On average half of the slots are lit.
-        variance = self._noise.through_picture(picture, picture * picture * error, np.full(1, 0.5, np.float32))
-        if measured is not None:
-            variance += measured
-        gain = picture * self._inside / variance
+        picture, variance = self.picture()
+        gain = picture * self._inside / (variance if measured is None else variance + measured)
         left, own, right = self._crosstalk.T
         products = np.stack([own * own, left * left, right * right, own * right, left * own, left * right])
         power = products @ (gain * picture)
@@ -320,42 +316,41 @@ def _resampled(values: Float32Array, rows: Float32Array, *, beyond: bool) -> Flo
 
 def _factored(
     middle: Float32Array, beside: Float32Array, beyond: Float32Array
-) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array]:
-    """D, the two bands of L, and the inverse of the diagonal of A^-1, of R symmetric systems (C, R) with two bands.
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """D, the bands of L, and the inverse of the diagonal of A^-1, of R symmetric systems (C, R) with two bands.
 
     A^-1 by the recursion of Takahashi, Fagan and Chin (1973): from the last column up.
     """
-    n, _ = middle.shape
-    diagonal, band_1, band_2 = middle.copy(), np.zeros_like(middle), np.zeros_like(middle)
+    n = len(middle)
+    rows = np.stack([middle, beside, beyond], axis=1)
+    bands = np.zeros_like(rows[:, 1:])
     # Diagonal of A^-1 and the negative of its first band, with two more rows of zeros for the ends.
     inverse, near = np.zeros((2, n + 2, middle.shape[1]), np.float32)
-    eliminated = beside.copy()
-    for i in range(n):
+    for i, row in enumerate(rows):
         if i >= 1:
-            diagonal[i] -= band_1[i - 1] * eliminated[i - 1]
-            eliminated[i] -= band_2[i - 1] * eliminated[i - 1]
+            row[:2] -= bands[i - 1] * rows[i - 1, 1]
         if i >= 2:
-            diagonal[i] -= band_2[i - 2] * beyond[i - 2]
-        inverse[i] = 1 / diagonal[i]
-        band_1[i], band_2[i] = eliminated[i] * inverse[i], beyond[i] * inverse[i]
+            row[0] -= bands[i - 2, 1] * rows[i - 2, 2]
+        inverse[i] = 1 / row[0]
+        bands[i] = row[1:] * inverse[i]
     for i in range(n - 1, -1, -1):
-        far = band_1[i] * near[i + 1] - band_2[i] * inverse[i + 2]
-        near[i] = band_1[i] * inverse[i + 1] - band_2[i] * near[i + 1]
-        inverse[i] += band_1[i] * near[i] - band_2[i] * far
-    return diagonal, band_1, band_2, np.asarray(1 / inverse[:n], np.float32)
+        band_1, band_2 = bands[i]
+        far = band_1 * near[i + 1] - band_2 * inverse[i + 2]
+        near[i] = band_1 * inverse[i + 1] - band_2 * near[i + 1]
+        inverse[i] += band_1 * near[i] - band_2 * far
+    return rows[:, 0], bands, np.asarray(1 / inverse[:n], np.float32)
 
 
 def _solve(system: _System, right: Float32Array) -> Float32Array:
     """The solution of every row, (C, R)."""
-    n = right.shape[0]
-    out = right.copy()
-    for i in range(1, n):
-        out[i] -= system.next[i - 1] * out[i - 1]
-        if i >= 2:
-            out[i] -= system.next_but_one[i - 2] * out[i - 2]
-    out /= system.diagonal
-    for i in range(n - 2, -1, -1):
-        out[i] -= system.next[i] * out[i + 1]
-        if i + 2 < n:
-            out[i] -= system.next_but_one[i] * out[i + 2]
-    return out
+    n = len(right)
+    # With two more columns of zeros for the ends.
+    out = np.pad(right, ((0, 2), (0, 0)))
+    for i in range(n):
+        out[i + 1 : i + 3] -= system.bands[i] * out[i]
+    out[:n] /= system.diagonal
+    for i in range(n - 1, -1, -1):
+        later = system.bands[i] * out[i + 1 : i + 3]
+        out[i] -= later[0]
+        out[i] -= later[1]
+    return out[:n]
