@@ -32,8 +32,8 @@ class _System:
     #: (C, S, R): gain of a strip's light.
     gain: Float32Array
     diagonal: Float32Array
-    #: (C, 2, R): the next column's part in an equation, and that of the next but one.
-    bands: Float32Array
+    next: Float32Array
+    next_but_one: Float32Array
     precision: Float32Array
 
 
@@ -316,41 +316,42 @@ def _resampled(values: Float32Array, rows: Float32Array, *, beyond: bool) -> Flo
 
 def _factored(
     middle: Float32Array, beside: Float32Array, beyond: Float32Array
-) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """D, the bands of L, and the inverse of the diagonal of A^-1, of R symmetric systems (C, R) with two bands.
+) -> tuple[Float32Array, Float32Array, Float32Array, Float32Array]:
+    """D, the two bands of L, and the inverse of the diagonal of A^-1, of R symmetric systems (C, R) with two bands.
 
     A^-1 by the recursion of Takahashi, Fagan and Chin (1973): from the last column up.
     """
-    n = len(middle)
-    rows = np.stack([middle, beside, beyond], axis=1)
-    bands = np.zeros_like(rows[:, 1:])
+    n, _ = middle.shape
+    diagonal, band_1, band_2 = middle.copy(), np.zeros_like(middle), np.zeros_like(middle)
     # Diagonal of A^-1 and the negative of its first band, with two more rows of zeros for the ends.
     inverse, near = np.zeros((2, n + 2, middle.shape[1]), np.float32)
-    for i, row in enumerate(rows):
+    eliminated = beside.copy()
+    for i in range(n):
         if i >= 1:
-            row[:2] -= bands[i - 1] * rows[i - 1, 1]
+            diagonal[i] -= band_1[i - 1] * eliminated[i - 1]
+            eliminated[i] -= band_2[i - 1] * eliminated[i - 1]
         if i >= 2:
-            row[0] -= bands[i - 2, 1] * rows[i - 2, 2]
-        inverse[i] = 1 / row[0]
-        bands[i] = row[1:] * inverse[i]
+            diagonal[i] -= band_2[i - 2] * beyond[i - 2]
+        inverse[i] = 1 / diagonal[i]
+        band_1[i], band_2[i] = eliminated[i] * inverse[i], beyond[i] * inverse[i]
     for i in range(n - 1, -1, -1):
-        band_1, band_2 = bands[i]
-        far = band_1 * near[i + 1] - band_2 * inverse[i + 2]
-        near[i] = band_1 * inverse[i + 1] - band_2 * near[i + 1]
-        inverse[i] += band_1 * near[i] - band_2 * far
-    return rows[:, 0], bands, np.asarray(1 / inverse[:n], np.float32)
+        far = band_1[i] * near[i + 1] - band_2[i] * inverse[i + 2]
+        near[i] = band_1[i] * inverse[i + 1] - band_2[i] * near[i + 1]
+        inverse[i] += band_1[i] * near[i] - band_2[i] * far
+    return diagonal, band_1, band_2, np.asarray(1 / inverse[:n], np.float32)
 
 
 def _solve(system: _System, right: Float32Array) -> Float32Array:
     """The solution of every row, (C, R)."""
-    n = len(right)
-    # With two more columns of zeros for the ends.
-    out = np.pad(right, ((0, 2), (0, 0)))
-    for i in range(n):
-        out[i + 1 : i + 3] -= system.bands[i] * out[i]
-    out[:n] /= system.diagonal
-    for i in range(n - 1, -1, -1):
-        later = system.bands[i] * out[i + 1 : i + 3]
-        out[i] -= later[0]
-        out[i] -= later[1]
-    return out[:n]
+    n = right.shape[0]
+    out = right.copy()
+    for i in range(1, n):
+        out[i] -= system.next[i - 1] * out[i - 1]
+        if i >= 2:
+            out[i] -= system.next_but_one[i - 2] * out[i - 2]
+    out /= system.diagonal
+    for i in range(n - 2, -1, -1):
+        out[i] -= system.next[i] * out[i + 1]
+        if i + 2 < n:
+            out[i] -= system.next_but_one[i] * out[i + 2]
+    return out
