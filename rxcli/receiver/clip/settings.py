@@ -94,7 +94,7 @@ class ClipSettings:
 
     #: Corners of two searches that differ by less than this, in screen widths, agree; searches where they do not.
     outlines_agree: float = 0.003
-    max_searches: int = 3
+    max_searches: int = 5
 
     #: A frame that shows fewer packets than this finds its clock with others; one that shows more does better alone.
     few_packets: float = 1.05

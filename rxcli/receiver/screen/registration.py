@@ -66,7 +66,7 @@ _MAX_SD, _MIN_CORRELATION = 0.0012, 0.35
 #: Share of the last frame's motion that the next is expected to repeat.
 _PERSISTENCE = 0.7
 #: Number of first frames that each update the texture, and the interval of updates afterwards.
-_FIRST_FRAMES, _LEARN_EVERY = 10, 4
+_FIRST_FRAMES, _LEARN_EVERY = 10, 8
 #: Maximum weight of the earlier frames in the texture, in frames.
 _MAX_WEIGHT = 40.0
 #: Points down and across through which the screen is projected.
