@@ -33,7 +33,7 @@ _ASPECT = 16 / 9
 _CELLS, _PARTS = (108, 360), (6, 18)
 #: Cells of a coarse cell down and across, and smoothing of the coarse texture in such cells.
 _COARSE, _COARSE_BLUR = np.array([2, 4]), 0.8
-#: Fine cells along a row of which the most informative one is compared; and rows that are read of a cell, at least.
+#: Adjacent fine cells along a row, whose most informative one is compared; and minimum number of rows read in a cell.
 _COMPARED_OF, _ROWS_READ = 2, 3
 #: Screen sizes around the expected screen that are searched.
 _REACH = 0.06
@@ -189,9 +189,9 @@ class ScreenTexture:
             corners = self._distorted(self._plane)
             reach = _REACH * _size(corners)
             size = np.array([frame.width, frame.height])
-            first = (corners.min(axis=0) - reach).clip(0, size // 4).astype(int)
-            last = (corners.max(axis=0) + reach).clip(size - size // 4, size).astype(int)
-            self._read_last = frame, _texture_of(frame, first, last, *self._cell)
+            start = (corners.min(axis=0) - reach).clip(0, size // 4).astype(int)
+            end = (corners.max(axis=0) + reach).clip(size - size // 4, size).astype(int)
+            self._read_last = frame, _texture_of(frame, start, end, *self._cell)
         return self._read_last[1]
 
     def _fit(
@@ -258,11 +258,11 @@ def _read(texture: _Texture, x: Float32Array, y: Float32Array) -> tuple[Float32A
     return read[..., 0], read[..., 1]
 
 
-def _texture_of(frame: Frame, first: IntArray, last: IntArray, cell_x: int, cell_y: int) -> _Texture:
-    """The texture of a part of a frame, from its `first` to its `last` x and y."""
+def _texture_of(frame: Frame, start: IntArray, end: IntArray, cell_x: int, cell_y: int) -> _Texture:
+    """The texture of a part of a frame, from its `start` to its `end` x and y."""
     import cv2
 
-    (left, top), (n_x, n_y) = first.tolist(), ((last - first) // (cell_x, cell_y)).tolist()
+    (left, top), (n_x, n_y) = start.tolist(), ((end - start) // (cell_x, cell_y)).tolist()
     pixels: NDArray[Any] = frame.pixels[top : top + n_y * cell_y, left : left + n_x * cell_x]
     every = max(cell_y // _ROWS_READ, 1)
     rows = range((cell_y - 1) % every // 2, cell_y, every)
@@ -279,7 +279,7 @@ def _texture_of(frame: Frame, first: IntArray, last: IntArray, cell_x: int, cell
     lit = np.maximum(mean - np.percentile(middle, _DARK_PERCENT).astype(np.float32), np.float32(1e-4))
     noise = np.float32(_CELL_NOISE / _STRIPE_NOISE) * (np.float32(1) if frame.linear else np.maximum(coded, 0.03)) / lit
     values = np.stack([np.clip((light - mean) / lit, -1, 1), 1 / (1 + noise * noise)], axis=2)
-    return _Texture(values, first.astype(np.float64), np.array([cell_x, cell_y], np.float64))
+    return _Texture(values, start.astype(np.float64), np.array([cell_x, cell_y], np.float64))
 
 
 def _coarser(texture: Float32Array) -> Float32Array:
@@ -299,7 +299,7 @@ def _known_of(texture: Float32Array, of_cells: int) -> _Known:
 
     Args:
         texture: (V, U, 2).
-        of_cells: one of so many cells along a row is compared.
+        of_cells: number of adjacent cells along a row whose most informative one is compared.
     """
     import cv2
 
