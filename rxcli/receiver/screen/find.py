@@ -179,7 +179,7 @@ def wide_grid(strips: Strips, sigma: float) -> Grid | None:
     best = with_light(some, grid_of_comb(combs[0], strips), sigma)
     if best.is_plain:
         return moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)
-    best = max((with_light(strips, grid_of_comb(comb, strips), sigma) for comb in combs), key=_score)
+    best = max([best, *(with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:])], key=_score)
     best = moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)
     best = with_light(strips, moved_by_waveforms(strips, best, sigma, SETTINGS.last_steps), sigma)
     return best if _stands_out(strips, best) else None

@@ -55,7 +55,7 @@ class FinderSettings:
     #: Distance of the pairs of strips that show the comb of borders best.
     pair_distance: float = 0.72
     #: Combs that are tried as grids.
-    n_combs: int = 4
+    n_combs: int = 8
     #: Minimum height of a comb, standard deviations by chance; contrast of the highest comb, as a share of the light it
     #: explains, from which no further combs are tried.
     min_comb: float = 6.0
