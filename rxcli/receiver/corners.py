@@ -61,7 +61,9 @@ def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
     """Outlines that the finder proposes of every screen."""
     layouts = layouts_of(options)
     with timer("geometry"):
-        screens = find_screens(timer.planes.plane(frame), layouts, known_lens(frame, options))
+        plane = timer.planes.plane(frame)
+        bright = bright_quadrilateral(plane)
+        screens = find_screens(plane, layouts, known_lens(frame, options), bright)
     single_wide = sum(not layout.is_narrow for layout in layouts) == 1
 
     def outline(candidate: OutlineCandidate) -> Outline:
@@ -79,23 +81,13 @@ def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
         return _as_viewed(found, frame.metadata.orientation)
 
     outlines = [[outline(candidate) for candidate in screen] for screen in screens]
-    if len(outlines) == 1:
-        outlines[0] += _bright_outline(frame, outlines[0], timer)
+    if len(outlines) == 1 and bright is not None:
+        own = Outline(bright, _BRIGHT_CERTAINTY, log_odds=_BRIGHT_LOG_ODDS, family=0)
+        own = _as_viewed(own, frame.metadata.orientation)
+        tolerance = _SAME_OUTLINE * np.ptp(bright[:, 0])
+        if all(np.abs(outline.corners - own.corners).max() >= tolerance for outline in outlines[0]):
+            outlines[0].append(own)
     return outlines
-
-
-def _bright_outline(frame: Frame, found: list[Outline], timer: Timer) -> list[Outline]:
-    """The outline of the bright part of the picture, unless it was found already."""
-    with timer("geometry"):
-        corners = bright_quadrilateral(timer.planes.plane(frame))
-    if corners is None:
-        return []
-    bright = _as_viewed(
-        Outline(corners, _BRIGHT_CERTAINTY, log_odds=_BRIGHT_LOG_ODDS, family=0), frame.metadata.orientation
-    )
-    tolerance = _SAME_OUTLINE * np.ptp(corners[:, 0])
-    is_found = any(np.abs(outline.corners - bright.corners).max() < tolerance for outline in found)
-    return [] if is_found else [bright]
 
 
 def layouts_of(options: ReceiverOptions) -> list[ColumnLayout]:

@@ -24,15 +24,16 @@ def column_map(frame: Frame) -> dict[str, Any] | None:
     from rxcli.options import ReceiverOptions
     from rxcli.receiver.corners import layouts_of
     from rxcli.receiver.plane import read_plane
-    from rxcli.receiver.screen.find import find_outlines
+    from rxcli.receiver.screen.bright import bright_quadrilateral
+    from rxcli.receiver.screen.find import find_screens
     from rxcli.receiver.screen.settings import SETTINGS
     from rxcli.receiver.screen.strips import read_strips
 
     if min(frame.width, frame.height) < SETTINGS.min_size_px:
         return None
     plane = read_plane(frame)
-    found = find_outlines(plane, layouts_of(ReceiverOptions()))
-    grids = [candidate.grid for candidate in found[:1]]
+    screens = find_screens(plane, layouts_of(ReceiverOptions()), bright=bright_quadrilateral(plane))
+    grids = [screen[0].grid for screen in screens[:1]]
     scale = _WIDTH / frame.width
     return {
         "title": "Where the columns may be",

@@ -13,8 +13,10 @@ from rxcli.types import FloatArray, LightPlane
 _WIDTH, _FILLED = 400, 41
 #: Area of the bright part: minimum shares of the picture and of the quadrilateral around it.
 _MIN_PICTURE, _MIN_FILL = 0.08, 0.93
-#: Distance from a straight side, in such pixels.
-_STRAIGHT = 1.5
+#: Distance from a straight side, in such pixels; maximum turn of a side, radians.
+_STRAIGHT, _MAX_TURN = 1.5, 0.25
+#: Distance from the picture's edge, in such pixels, within which a side may be the picture's; maximum number of those.
+_AT_EDGE, _MAX_HIDDEN = 2.0, 1
 
 
 def bright_quadrilateral(plane: LightPlane) -> FloatArray | None:
@@ -32,20 +34,27 @@ def bright_quadrilateral(plane: LightPlane) -> FloatArray | None:
     contours, _ = cv2.findContours(padded, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     hull = cv2.convexHull(max(contours, key=cv2.contourArea))
     polygon = cv2.approxPolyDP(hull, _STRAIGHT, True).reshape(-1, 2).astype(np.float64)
-    if len(polygon) < 4 or cv2.contourArea(hull) < _MIN_PICTURE * small.size:
+    sides = _longest_sides(polygon)
+    if sides is None or cv2.contourArea(hull) < _MIN_PICTURE * small.size:
         return None
-    corners = _longest_sides(polygon)
-    if cv2.contourArea(hull) < _MIN_FILL * cv2.contourArea(corners.astype(np.float32)):
+    lines = np.cross(*np.concatenate([sides, np.ones((2, 4, 1))], axis=2))
+    meets = np.cross(np.roll(lines, 1, axis=0), lines)
+    corners = meets[:, :2] / meets[:, 2:]
+    top, right, bottom, left = sides.mean(axis=0) - _FILLED
+    room = np.array([top[1], small.shape[1] - 1 - right[0], small.shape[0] - 1 - bottom[1], left[0]])
+    is_whole = cv2.contourArea(hull) >= _MIN_FILL * cv2.contourArea(corners.astype(np.float32))
+    if not is_whole or (room < _AT_EDGE).sum() > _MAX_HIDDEN:
         return None
-    by_angle = np.arctan2(*(corners - corners.mean(axis=0)).T[::-1]).argsort()
-    return np.asarray((corners[by_angle] - _FILLED + 0.5) * pixels - 0.5)
+    return np.asarray((corners - _FILLED + 0.5) * pixels - 0.5)
 
 
-def _longest_sides(polygon: FloatArray) -> FloatArray:
-    """Corners (4, 2) at which the four longest sides of a convex polygon (n, 2) meet."""
-    sides = np.roll(polygon, -1, axis=0) - polygon
-    longest = np.sort(np.argsort(-np.hypot(*sides.T))[:4])
-    normals = sides[longest][:, ::-1] * np.array([1.0, -1.0])
-    offsets = (normals * polygon[longest]).sum(axis=1)
-    pairs = [[k, (k + 1) % len(longest)] for k in range(len(longest))]
-    return np.stack([np.linalg.lstsq(normals[pair], offsets[pair], rcond=None)[0] for pair in pairs])
+def _longest_sides(polygon: FloatArray) -> FloatArray | None:
+    """Starts and ends (2, 4, 2) of the longest top, right, bottom and left side of a convex polygon (n, 2).
+
+    A dark corner of the picture on the screen cuts off the screen's, so that the longest sides of all may be others.
+    """
+    ends = np.roll(polygon, -1, axis=0)
+    along = ((ends - polygon) @ np.array([1, 1j]))[:, None] * 1j ** -np.arange(4)
+    length = np.where(np.abs(np.angle(along)) < _MAX_TURN, np.abs(along), 0.0)
+    longest = length.argmax(axis=0)
+    return np.stack([polygon[longest], ends[longest]]) if length.any(axis=0).all() else None

@@ -70,18 +70,8 @@ class OutlineCandidate:
     unlit_sides: tuple[str, ...]
 
 
-def find_outlines(
-    plane: LightPlane, layouts: Sequence[ColumnLayout], lens: Lens | None = None
-) -> list[OutlineCandidate]:
-    """Candidate outlines of the screen in a picture, likeliest first; none if no columns are found.
-
-    Args: see `find_screens`.
-    """
-    return next(iter(find_screens(plane, layouts, lens)), [])
-
-
 def find_screens(
-    plane: LightPlane, layouts: Sequence[ColumnLayout], lens: Lens | None = None
+    plane: LightPlane, layouts: Sequence[ColumnLayout], lens: Lens | None = None, bright: FloatArray | None = None
 ) -> list[list[OutlineCandidate]]:
     """Candidate outlines of each screen in a picture, likeliest first; the clearest screen comes first.
 
@@ -89,7 +79,13 @@ def find_screens(
         plane: of the picture.
         layouts: that the screen may have.
         lens: of the picture, if known.
+        bright: corners (4, 2) of the bright part of the picture, clockwise from its top left, where borders of columns
+            are looked for as well.
     """
+
+    def at_bright_part(layout: ColumnLayout) -> Grid | None:
+        return None if bright is None else grid_between(bright, layout.n_columns, (plane.width, plane.height), lens)
+
     strips = _strips_of(plane, lens)
     if strips is None:
         return []
@@ -99,10 +95,10 @@ def find_screens(
         return screens
     if narrow and shows_narrow_columns(strips):
         fine = read_strips(plane, lens, n_parts=_PARTS)
-        grid = narrow_grid(fine, narrow[0].sigma)
+        grid = narrow_grid(fine, narrow[0].sigma, at_bright_part(narrow[0]))
         if grid is not None:
             return [_numbered(fine, grid, narrow)]
-    grid = wide_grid(strips, wide[0].sigma) if wide else None
+    grid = wide_grid(strips, wide[0].sigma, at_bright_part(wide[0])) if wide else None
     return [] if grid is None else [_numbered(strips, grid, wide)]
 
 
@@ -171,18 +167,23 @@ def follow_outline(plane: LightPlane, corners: FloatArray, layout: ColumnLayout)
     return flat.corners(ends[0])
 
 
-def wide_grid(strips: Strips, sigma: float) -> Grid | None:
-    """The grid of wide columns that explains the strips' light best, or None."""
+def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid | None:
+    """The grid of wide columns that explains the strips' light best, or None.
+
+    Args:
+        strips: of the picture.
+        sigma: light spread of the screen, column pitches.
+        rival: a grid that competes with those of the combs, unless the strongest comb's is plain.
+    """
     some, combs = strips.blocks(slice(None, None, 2)), _possible_combs(strips, sigma)
-    if not combs:
-        return None
-    best = with_light(some, grid_of_comb(combs[0], strips), sigma)
-    if best.is_plain:
-        return moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)
-    best = max([best, *(with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:])], key=_score)
-    best = moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)
-    best = with_light(strips, moved_by_waveforms(strips, best, sigma, SETTINGS.last_steps), sigma)
-    return best if _stands_out(strips, best) else None
+    if combs and (first := with_light(some, grid_of_comb(combs[0], strips), sigma)).is_plain:
+        return moved_by_waveforms(some, first, sigma, SETTINGS.first_steps)
+    best = max((with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs), key=_score, default=None)
+    starts = [] if best is None else [moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)]
+    starts += [rival] if rival is not None and with_light(some, rival, sigma).contrast > 0 else []
+    moved = [moved_by_waveforms(strips, grid, sigma, SETTINGS.last_steps) for grid in starts]
+    settled = [with_light(strips, grid, sigma) for grid in moved]
+    return max((grid for grid in settled if _stands_out(strips, grid)), key=_score, default=None)
 
 
 def shows_columns_plainly(plane: LightPlane, sigma: float) -> bool:
@@ -200,10 +201,11 @@ def _score(grid: Grid) -> float:
     return grid.explained + SETTINGS.contrast_weight * grid.contrast
 
 
-def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
+def narrow_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid | None:
     """The grid of narrow columns, or None.
 
-    The parts of the picture are searched, from the middle on. A clear grid is followed over the whole width.
+    The parts of the picture are searched, from the middle on. A clear grid is followed over the whole width. If
+    there is none, the rival is followed, from the middle on. Args: see `wide_grid`.
     """
     some, few = (strips.blocks(slice(None, None, step)) for step in (2, 4))
     for part in sorted(range(strips.n_parts), key=lambda part: abs(part - strips.n_parts // 2)):
@@ -216,7 +218,10 @@ def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
             grid = with_light(some, _followed(some, grid, float(own.raw_x.mean()), sigma), sigma)
             if _stands_out(some, grid, SETTINGS.min_plain_contrast):
                 return grid
-    return None
+    if rival is None or with_light(few, rival, sigma).contrast <= 0:
+        return None
+    rival = with_light(some, _followed(some, rival, 0.0, sigma), sigma)
+    return rival if _stands_out(some, rival) else None
 
 
 def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:

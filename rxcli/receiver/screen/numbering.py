@@ -27,16 +27,15 @@ _OUTSIDE, _LARGER = -4.0, -3.0
 #: Standard deviation of the light's middle about the screen's middle, screen widths.
 _LIGHT_SD = 0.175
 #: Columns of the picture that must lie beyond light which ends in the picture.
-_IN_VIEW = 0.4
+_IN_VIEW = 0.3
 #: Light begins at a border if the log-odds inside exceed this and those beyond stay below this share of them; log-odds
 #: that this adds.
 _BEGINS_ODDS, _BEYOND, _ON_BORDER = 2.0, 0.3, 3.0
-#: A film has dark bars beside it. It begins where its level exceeds this share between dark and bright (percentiles
-#: over the columns). The level left over at this distance beside it, its minimum width as a share of the screen's, the
-#: minimum width of its bars together and its maximum offset from the screen's middle, columns. Log-odds that a film
-#: adds with the usual number of columns; with more columns it is less likely by chance.
+#: A bright picture has dark on both sides. It begins where its level exceeds this share between dark and bright
+#: (percentiles over the columns). The level left over at this distance beside it, its maximum offset from the screen's
+#: middle, columns, and the log-odds that it adds.
 _DARK, _BRIGHT, _BEGINS = 5, 75, 0.25
-_LEFT_OVER, _BESIDE, _MIN_FILM, _BARS, _IN_MIDDLE, _FILM, _USUAL_COLUMNS = 0.12, 0.45, 0.53, 1.0, 0.2, 3.5, 20
+_LEFT_OVER, _BESIDE, _IN_MIDDLE, _FILM = 0.12, 0.45, 0.2, 3.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +47,7 @@ class LightProfile:
     in_picture: BoolArray
     #: (P,) log-odds that a part is on the screen.
     log_odds: FloatArray
-    #: Columns at which a film with dark bars beside it begins and ends, or None.
+    #: Columns at which a bright picture with dark on both sides begins and ends, or None.
     film: tuple[float, float] | None
 
     @property
@@ -125,7 +124,7 @@ class FirstColumns:
 def first_columns(light: LightProfile, n_columns: int) -> FirstColumns:
     """Log-odds of each column of a grid to be the first of a screen with `n_columns`.
 
-    Light outside the screen, columns outside the picture and a film in the screen's middle decide. If columns are dark
+    Light outside the screen, columns outside the picture and a bright picture in the middle decide. If columns are dark
     at both ends and no such evidence exists, several candidates remain equally likely.
     """
     shown = light.place[light.in_picture]
@@ -138,14 +137,9 @@ def first_columns(light: LightProfile, n_columns: int) -> FirstColumns:
     odds = _light_within(light, starts, ends) - 0.5 * np.square(off / (_LIGHT_SD * n_columns))
     odds += _hidden(np.maximum(np.stack([left - starts, ends - right]), 0.0), reaches)
     odds += _ON_BORDER * (_begins(light, starts, 1) + 1.0 * _begins(light, ends, -1))
-    if light.film is not None and _is_film(light.film, n_columns):
-        more = float(np.log(n_columns / _USUAL_COLUMNS))
-        odds += (_FILM + more) * (np.abs(sum(light.film) / 2 - middles) < _IN_MIDDLE)
+    if light.film is not None:
+        odds += _FILM * (np.abs(sum(light.film) / 2 - middles) < _IN_MIDDLE)
     return FirstColumns(starts, odds, bool(reaches.all()))
-
-
-def _is_film(film: tuple[float, float], n_columns: int) -> bool:
-    return _MIN_FILM * n_columns < film[1] - film[0] < n_columns - _BARS
 
 
 def _hidden(columns: FloatArray, reaches: BoolArray) -> FloatArray:
@@ -159,7 +153,7 @@ def _hidden(columns: FloatArray, reaches: BoolArray) -> FloatArray:
 def _begins(light: LightProfile, borders: IntArray, side: int) -> BoolArray:
     """(F,) whether light begins on each border, to its right (1) or left (-1)."""
     off = side * (light.place - borders[:, None])
-    beyond = (off < -1 / _PARTS) & (off > -0.5)
+    beyond = (off < -1 / _PARTS) & (off > -0.4)
     inside, outside = ((off > 1 / _PARTS) & (off < 0.5)) @ light.log_odds, beyond @ light.log_odds
     is_shown = (light.in_picture | ~beyond).all(axis=1)
     return np.asarray(is_shown & (inside > _BEGINS_ODDS) & (outside < _BEYOND * inside))

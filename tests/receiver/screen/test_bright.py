@@ -27,7 +27,16 @@ def picture_of(corners: np.ndarray, level: int = 200, dark: tuple[slice, slice] 
     return Frame(pixels, "drawn")
 
 
-@pytest.mark.parametrize("dark", [None, (slice(400, 500), slice(600, 700)), (slice(0, 180), slice(0, 300))])
+@pytest.mark.parametrize(
+    "dark",
+    [
+        None,
+        (slice(400, 500), slice(600, 700)),
+        (slice(0, 180), slice(0, 300)),
+        (slice(0, 300), slice(0, 800)),
+    ],
+    ids=["whole", "hole", "corner", "large corner"],
+)
 def test_corners_of_a_bright_part(dark: tuple[slice, slice] | None) -> None:
     found = bright_quadrilateral(read_plane(picture_of(CORNERS, dark=dark)))
     assert found is not None
@@ -39,8 +48,9 @@ def test_corners_of_a_bright_part(dark: tuple[slice, slice] | None) -> None:
     [
         np.array([[800.0, 500.0], [1000.0, 500.0], [1000.0, 660.0], [800.0, 660.0]]),
         np.array([[800.0, 20.0], [1500.0, 900.0], [1500.0, 901.0], [100.0, 900.0]]),
+        np.array([[-9.0, 100.0], [1609.0, 100.0], [1609.0, 900.0], [-9.0, 900.0]]),
     ],
-    ids=["small", "triangle"],
+    ids=["small", "triangle", "two sides in view"],
 )
 def test_what_is_no_screen(corners: np.ndarray) -> None:
     assert bright_quadrilateral(read_plane(picture_of(corners))) is None

@@ -12,15 +12,16 @@ import pytest
 from numpy.typing import NDArray
 
 from rxcli.receiver.plane import read_plane
-from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen import find, geometry
 from rxcli.receiver.screen.combs import find_combs, likeness
 from rxcli.receiver.screen.find import (
     ColumnLayout,
     OutlineCandidate,
-    find_outlines,
+    find_screens,
     follow_outline,
     shows_columns_plainly,
     why_useless,
+    wide_grid,
 )
 from rxcli.receiver.screen.grid import columns_at, grid_between
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
@@ -97,6 +98,11 @@ def drawn(*args: Any, **options: Any) -> LightPlane:
 
 def plane_of(pixels: NDArray[Any]) -> LightPlane:
     return read_plane(Frame(pixels, "memory"))
+
+
+def find_outlines(plane: LightPlane, layouts: list[ColumnLayout], lens: Lens | None = None) -> list[OutlineCandidate]:
+    """Outlines of the clearest screen, likeliest first."""
+    return next(iter(find_screens(plane, layouts, lens)), [])
 
 
 @lru_cache(maxsize=8)
@@ -249,6 +255,16 @@ def test_the_true_grid_explains_more_than_others_and_is_reached_from_near() -> N
     assert np.abs(off).max() < 0.3
 
 
+def test_a_rival_replaces_missing_combs_where_borders_show(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(find, "find_combs", lambda *_: [])
+    strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    x, y = strips.x, strips.y
+    reached = wide_grid(strips, 0.45, true.shifted(0.2))
+    assert reached is not None
+    assert np.abs(columns_at(reached.numbers, x, y) - columns_at(true.numbers, x, y)).max() < 0.3
+    assert wide_grid(strips, 0.45, true.shifted(0.5)) is None
+
+
 def profile_of(picture: str) -> LightProfile:
     strips, grid = read_strips(drawn(picture)), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
     return light_profile(strips, predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), 0.45), grid)
@@ -277,6 +293,14 @@ def test_narrow_bars_on_both_sides_show_the_first_column(film: tuple[float, floa
     in_doubt = (start.log_odds > start.log_odds.max() - 2).sum() > 1
     assert start.columns[start.log_odds.argmax()] == 0 or in_doubt
     assert in_doubt == (sum(film) != 20)
+
+
+def test_light_that_ends_just_before_the_edge_of_the_picture_ends_on_the_screen() -> None:
+    place = (np.arange(-8, 20 * 8 + 3) + 0.5) / 8
+    light = np.where((place > 7) & (place < 20), 1.3, -0.1)
+    start = first_columns(LightProfile(place, np.ones(place.size, bool), light, None), 20)
+    assert start.columns[start.log_odds.argmax()] == 0
+    assert not start.fills
 
 
 def test_light_ends_where_bars_begin_and_takes_no_more_than_a_screen() -> None:
