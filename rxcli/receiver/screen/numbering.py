@@ -153,7 +153,7 @@ def _hidden(columns: FloatArray, reaches: BoolArray) -> FloatArray:
 def _begins(light: LightProfile, borders: IntArray, side: int) -> BoolArray:
     """(F,) whether light begins on each border, to its right (1) or left (-1)."""
     off = side * (light.place - borders[:, None])
-    beyond = (off < -1 / _PARTS) & (off > -0.4)
+    beyond = (off < -1 / _PARTS) & (off > -0.5)
     inside, outside = ((off > 1 / _PARTS) & (off < 0.5)) @ light.log_odds, beyond @ light.log_odds
     is_shown = (light.in_picture | ~beyond).all(axis=1)
     return np.asarray(is_shown & (inside > _BEGINS_ODDS) & (outside < _BEYOND * inside))
