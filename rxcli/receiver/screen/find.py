@@ -187,7 +187,7 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
 
 
 def shows_columns_plainly(plane: LightPlane, sigma: float) -> bool:
-    """Whether a picture shows wide columns more plainly than by chance; cheaper than `find_outlines`."""
+    """Whether a picture shows wide columns more plainly than by chance; cheaper than `find_screens`."""
     strips = _strips_of(plane)
     if strips is None:
         return False
