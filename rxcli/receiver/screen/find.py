@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import Comb, find_combs, grid_of_comb
-from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_through
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.settings import SETTINGS
@@ -177,9 +177,11 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
     """
     some, combs = strips.blocks(slice(None, None, 2)), _possible_combs(strips, sigma)
     if combs and (strongest := with_light(some, grid_of_comb(combs[0], strips), sigma)).is_plain:
-        return moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
+        strongest = moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
+        return moved_by_waveforms(strips, strongest, sigma, SETTINGS.last_steps)
     best = max((with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs), key=_score, default=None)
     starts = [] if best is None else [moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)]
+    starts += [slipped_grid(strips.blocks(slice(None, None, 4)), starts[0], sigma)] if starts else []
     starts += [rival] if rival is not None and with_light(some, rival, sigma).contrast > 0 else []
     moved = [moved_by_waveforms(strips, grid, sigma, SETTINGS.last_steps) for grid in starts]
     settled = [with_light(strips, grid, sigma) for grid in moved]
@@ -199,6 +201,21 @@ def shows_columns_plainly(plane: LightPlane, sigma: float) -> bool:
 def _score(grid: Grid) -> float:
     """Log-likelihood by which grids are compared."""
     return grid.explained + SETTINGS.contrast_weight * grid.contrast
+
+
+def slipped_grid(strips: Strips, grid: Grid, sigma: float) -> Grid:
+    """The best grid that differs from the given one by a column at the left or at the right.
+
+    Where light is faint at an end, the columns there may be counted wrong.
+    """
+    x, y = strips.x.ravel(), strips.y.ravel()
+    u = columns_at(grid.numbers, x, y)
+    grids = []
+    for end_weight in (np.square(strips.raw_x.ravel() + 0.5), np.square(strips.raw_x.ravel() - 0.5)):
+        for shift in (-end_weight, end_weight):
+            moved = moved_by_waveforms(strips, grid_through(grid, x, y, u + shift), sigma, SETTINGS.last_steps)
+            grids.append(with_light(strips, moved, sigma))
+    return max(grids, key=_score)
 
 
 def narrow_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid | None:

@@ -21,7 +21,7 @@ from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 #: Averaged rows whose mean the band pass takes off.
-LONG_ROWS = 7
+LONG_ROWS = 8
 #: Arrays by block and strip.
 _OF_STRIPS = ("changes", "lit", "level", "raw_x", "raw_y", "x", "y")
 
@@ -109,11 +109,11 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
     """
     light, x = _light_of_strips(plane, n_parts)
     short, n_windows = _short_rows(light), SETTINGS.n_windows
-    light = _means_of_rows(light, short)
-    rows = light.shape[1] // n_windows
+    means = _means_of_rows(light, short)
+    rows = means.shape[1] // n_windows
     middles = (np.arange(n_windows) + 0.5) * rows * short - 0.5
     points = np.stack(np.meshgrid(x, middles), axis=-1)
-    changes, lit, noise = _without_row_noise(_windows(_band_passed(light)))
+    changes, lit, noise = _without_row_noise(_windows(_band_passed(light, means, short)))
 
     def parted(values: NDArray[_Real]) -> NDArray[_Real]:
         """(W, S, ...) as (parts x W, S / parts, ...)."""
@@ -125,7 +125,7 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
     return Strips(
         parted(changes),
         parted(lit),
-        parted(light.reshape(x.size, n_windows, rows).mean(axis=2).T),
+        parted(means.reshape(x.size, n_windows, rows).mean(axis=2).T),
         raw_x,
         raw_y,
         x_flat,
@@ -181,11 +181,12 @@ def _means_of_rows(light: Float32Array, short: int) -> Float32Array:
     return np.asarray(cv2.resize(light[:, : n * short], (n, len(light)), interpolation=cv2.INTER_AREA), np.float32)
 
 
-def _band_passed(light: Float32Array) -> Float32Array:
-    """(S, R) light minus its mean over `LONG_ROWS` rows."""
+def _band_passed(light: Float32Array, means: Float32Array, short: int) -> Float32Array:
+    """(S, R) means over `short` rows, less the mean of `LONG_ROWS` times as many rows around them."""
     import cv2
 
-    return np.asarray(light - cv2.blur(light, (LONG_ROWS, 1)), np.float32)
+    around = cv2.blur(light, (LONG_ROWS * short, 1))[:, short // 2 :: short]
+    return np.asarray(means - around[:, : means.shape[1]], np.float32)
 
 
 def _short_rows(light: Float32Array) -> int:
