@@ -32,6 +32,8 @@ def bright_quadrilateral(plane: LightPlane) -> FloatArray | None:
     padded = cv2.copyMakeBorder(bright, _FILLED, _FILLED, _FILLED, _FILLED, cv2.BORDER_CONSTANT, value=0)
     padded = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((_FILLED, _FILLED), np.uint8))
     contours, _ = cv2.findContours(padded, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not contours:
+        return None
     hull = cv2.convexHull(max(contours, key=cv2.contourArea))
     polygon = cv2.approxPolyDP(hull, _STRAIGHT, True).reshape(-1, 2).astype(np.float64)
     sides = _longest_sides(polygon)

@@ -188,14 +188,10 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
     return max((grid for grid in settled if _stands_out(strips, grid)), key=_score, default=None)
 
 
-def shows_columns_plainly(plane: LightPlane, sigma: float) -> bool:
-    """Whether a picture shows wide columns more plainly than by chance; cheaper than `find_screens`."""
+def shows_columns(plane: LightPlane, sigma: float) -> bool:
+    """Whether a picture shows wide columns."""
     strips = _strips_of(plane)
-    if strips is None:
-        return False
-    some, combs = strips.blocks(slice(None, None, 2)), _possible_combs(strips, sigma)
-    grids = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs]
-    return any(_stands_out(some, grid, SETTINGS.min_plain_contrast) for grid in grids)
+    return strips is not None and wide_grid(strips, sigma) is not None
 
 
 def _score(grid: Grid) -> float:

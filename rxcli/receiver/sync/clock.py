@@ -203,7 +203,7 @@ def find_clock(
     period = packet_slots * SETTINGS.search_samples
     power = folded(np.maximum(response.mean(axis=0), 0) ** 2, period)
     start, header_peak_ratio = header_comb(power, SETTINGS.search_samples)
-    if not np.isfinite(start):
+    if not header_peak_ratio:
         return None
     # Twice the correlation less the contrast is proportional to the log-likelihood ratio against random slots.
     length = SLOTS_PER_SYMBOL * SETTINGS.search_samples
@@ -253,13 +253,15 @@ def _row_span(profiles: RowProfiles) -> tuple[float, float]:
 def header_comb(score: FloatArray, samples_per_slot: int) -> tuple[float, float]:
     """Start of packets, in samples, with the largest header correlation, and its ratio to the next rival.
 
+    The ratio is 0 if no correlation is positive.
+
     Args:
         score: (period,) power of the header correlation at each position in a packet, copies added.
         samples_per_slot: samples per slot.
     """
     best = int(score.argmax())
     if score[best] <= 0:
-        return float("nan"), 0.0
+        return 0.0, 0.0
     around = score[[best - 1, best, (best + 1) % score.size]]
     offset = float(_parabola(around[None], np.array([1]))[0])
     return best + offset, float(score[best] / _rival(score, best, samples_per_slot))
