@@ -142,14 +142,17 @@ def test_a_screen_at_rest_is_looked_for_now_and_then_until_it_moves(monkeypatch:
 def test_a_picture_without_texture_is_followed_by_its_outline() -> None:
     flat = filmed(scene_in_hand(4.0, picture=np.full((90, 160, 3), 190, np.uint8)))
     results, score = received(flat)
-    assert score.error_free >= 0.9 * score.expected
+    assert score.error_free >= 0.85 * score.expected
     assert surely_wrong(results) == 0
 
 
 @pytest.mark.parametrize("change", [Change(5, light=0.5), Change(5, blur_px=2.5)])
 def test_a_step_of_exposure_or_focus(change: Change) -> None:
-    results, score = received(filmed(scene_in_hand(2.0, changes=(change,))))
-    assert score.error_free >= 0.85 * score.expected
+    """It costs at most the bursts of three frames."""
+    clip = filmed(scene_in_hand(2.0, changes=(change,)))
+    results, score = received(clip)
+    shown = {b.burst for f in clip[1].frames[change.frame : change.frame + 3] for b in f.bursts}
+    assert score.error_free >= 0.95 * (score.expected - 20 * len(shown))
     assert surely_wrong(results) == 0
 
 
