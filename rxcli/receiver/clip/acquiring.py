@@ -1,8 +1,8 @@
 """The first frames of a clip: they agree on where the screen is, and the surest of their cameras counts.
 
-The strips of a whole clip lie where its first frame has the screen, and a single dark frame may be wrong by twenty
-pixels there. The texture of the picture gives the motion of the screen from the first frame to the next ones. The
-outlines found in these are carried back, and their median is used. If the second agrees, two are enough.
+The strips of a whole clip lie where its first frame has the screen. Plain packets there settle the outline. A frame
+without them may be wrong by many pixels: then the texture of the picture gives the motion of the screen from the first
+frame to the next ones, the outlines found in these are carried back, and their median is used.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class FirstFrames:
     frames: tuple[Frame, ...]
     #: Where the screen is in the first of them, with the surest of their cameras.
     located: Located
-    #: Of the screen; None where there is nothing to compare an outline with, or the user gave the corners.
+    #: Of the screen; None where its outline is sure, or there is nothing to compare an outline with.
     texture: ScreenTexture | None
     #: Corners (4, 2) that were found in each frame, carried back to the first, less those found there.
     differences: tuple[FloatArray, ...]
@@ -38,7 +38,8 @@ class FirstFrames:
         if isinstance(located, Failure):
             return located
         corners = located.context.corners
-        texture = None if camera.options.corners is not None else ScreenTexture(frame, corners, None)
+        is_sure = camera.options.corners is not None or located.is_plain
+        texture = None if is_sure else ScreenTexture(frame, corners, None)
         return cls((frame,), located, texture, (np.zeros_like(corners),))
 
     @property
@@ -57,11 +58,8 @@ class FirstFrames:
 
     @property
     def _agree(self) -> bool:
-        """Whether the outline is sure."""
-        found = self.differences
-        if self.texture is None or len(found) >= SETTINGS.max_searches:
-            return True
-        return len(found) == 2 and bool(np.abs(found[1]).max() < SETTINGS.outlines_agree * self._width)
+        """Whether no further outline is needed."""
+        return self.texture is None or len(self.differences) >= SETTINGS.max_searches
 
     @property
     def _width(self) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -48,13 +48,14 @@ class Burst:
     @cached_property
     def posteriors(self) -> BurstPosteriors:
         """Of this burst alone; columns that are not tried are unknown."""
-        columns = np.flatnonzero(self.tried)
-        unknown = _unobserved(self.metrics, self.tried.size)
+        columns, n_columns = np.flatnonzero(self.tried), self.tried.size
         if not columns.size:
-            return unknown
+            return _unobserved(n_columns, *self.metrics.shape[1:])
         metrics = self.metrics[None, columns]
         found = detect.detect(metrics, detect.plausible_weights(metrics, receiver_settings.weight_margin))
-        return found if columns.size == self.tried.size else unknown.with_columns(columns, found)
+        if columns.size == n_columns:
+            return found
+        return _unobserved(n_columns, *self.metrics.shape[1:]).with_columns(columns, found)
 
     @property
     def certain(self) -> BoolArray:
@@ -66,8 +67,9 @@ class Burst:
         """(C,) of the packets as detected, by the light model alone."""
         return np.asarray(np.exp(self.posteriors.log_prob[0].sum(axis=1)), np.float32)
 
-    def ended(self, first_number: int, n_strips: int) -> confidence.BurstInClip:
-        """What is reported of it; `first_number` is that of the first burst of the last frame that shows it."""
+    def ended(self, view: View) -> confidence.BurstInClip:
+        """What is reported of it; `view` is of the last frame that shows it."""
+        assert view.numbers is not None
         features = against = None
         if self.tracked:
             llr = slot_llr(self.metrics[None])[0, :, PREAMBLE_SLOTS:]
@@ -76,8 +78,9 @@ class Burst:
         else:
             margin = detect.slot_margin(self.metrics[None], self.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
             undenoised = np.zeros(margin.shape[1], bool)
+            n_strips = view.acquisition.binned.light.shape[1]
             features = confidence.confidence_features(self.posteriors, margin, undenoised, n_strips)[0]
-        index = self.number - first_number
+        index = self.number - int(view.numbers[0])
         return confidence.BurstInClip(
             self.number, index, self.posteriors, self.n_observed, self.frames, features, against
         )
@@ -98,7 +101,7 @@ def has_light(view: View) -> BoolArray:
     """(C,) columns of a frame with enough light to try; now and then, and of a photograph, all of them."""
     if view.flat is None or (view.bursts.frame + 1) % SETTINGS.try_dark_every == 0:
         return np.ones(len(view.snr), bool)
-    return np.asarray(np.median(view.snr, axis=1) >= SETTINGS.dark_snr)
+    return np.asarray(view.snr[:, 0] >= SETTINGS.dark_snr)
 
 
 def lit_slots(view: View, bursts: Sequence[Burst]) -> Float32Array:
@@ -141,8 +144,9 @@ def with_common_memory(metrics: Sequence[FloatArray]) -> list[FloatArray]:
     return [written(some) for some in metrics]
 
 
-def _unobserved(like: FloatArray, n: int) -> BurstPosteriors:
-    """Posteriors of `n` columns of a burst without light, of metrics such as (..., packet + memory, patterns)."""
+@lru_cache(maxsize=8)
+def _unobserved(n_columns: int, n_metrics: int, n_patterns: int) -> BurstPosteriors:
+    """Posteriors of the columns of a burst without light."""
     middle = np.arange(len(WEIGHTS)) == len(WEIGHTS) // 2
-    blank = detect.detect(np.zeros((1, 1, *like.shape[-2:])), middle[None])
-    return replace(blank, lit=np.full_like(blank.lit, 0.5)).of_columns(np.zeros(n, np.int64))
+    blank = detect.detect(np.zeros((1, 1, n_metrics, n_patterns)), middle[None])
+    return replace(blank, lit=np.full_like(blank.lit, 0.5)).of_columns(np.zeros(n_columns, np.int64))

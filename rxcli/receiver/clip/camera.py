@@ -41,6 +41,11 @@ class Located:
             return 0.0
         return np.inf if isinstance(self.found, Failure) else camera.estimated["line_delay_s"][1] / camera.line_delay_s
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether packets settle the outline beyond doubt."""
+        return isinstance(self.found, Found) and self.found.best.evidence >= search_settings.plain
+
     def moved_to(self, corners: FloatArray) -> Located:
         """The same with the screen at the corners (4, 2)."""
         return Located(replace(self.outline, corners=corners), replace(self.context, corners=corners), None)

@@ -311,8 +311,7 @@ class Ledger:
             self._last_closed = max(self._last_closed, burst.number)
             del self._bursts[burst.number]
             waiting.skip("dark_columns", int((~burst.tried).sum()))
-        n_strips = view.acquisition.binned.light.shape[1]
-        ended = [burst.ended(int(view.numbers[0]), n_strips) for burst in closed]
+        ended = [burst.ended(view) for burst in closed]
         probabilities = [np.zeros(len(view.snr), np.float32), *(burst.probability for burst in going_on)]
         columns = assemble.clip_results(
             view.bursts.clock,

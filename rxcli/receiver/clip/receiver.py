@@ -158,12 +158,12 @@ def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | 
     else:
         state, view, report = _receive_anew(state.known, frame, located, timer)
         waiting.update(denoiser=report)
-    waiting.update(message=waiting.result.message or state.known.camera.message)
     if isinstance(view, Failure):
         waiting.update(status=view.status, message=view.message, timing_ms=timer.total())
         return state, ledger.add(waiting, scene_ends=True)
     waiting.update(
         **view.context.camera.result_fields,
+        message=message or state.known.camera.message,
         screen_profile=view.acquisition.screen.name,
         corners=state.known.corners,
     )

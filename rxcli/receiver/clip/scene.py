@@ -349,8 +349,8 @@ class TrackedScreen:
             self._n_updates += 1
         self.last = view
 
-    def learn(self, view: View, lit: Float32Array, *, forget: bool = True) -> known_picture.Observation | None:
-        """Take a frame into the picture; returns what it showed.
+    def learn(self, view: View, lit: Float32Array, *, forget: bool = True) -> Float32Array | None:
+        """Take a frame into the picture; returns the update of the picture.
 
         See `known_picture.KnownPicture.learn` for `forget`.
         """
@@ -364,8 +364,7 @@ class TrackedScreen:
         observation = known_picture.Observation(
             view.light, slots, trust, view.pose.placement, self._frame_rows(view.pose)
         )
-        self._picture.learn(observation, forget=forget)
-        return observation
+        return self._picture.learn(observation, forget=forget)
 
     def _frame_rows(self, pose: Pose) -> Float32Array | None:
         """(C, P) row of a frame that shows each row of the picture; None where that is where the first one did."""
@@ -388,10 +387,10 @@ class TrackedScreen:
         """
         self._n_updates = 0
         self._picture = self._new_picture(self._dark_light(views))
-        observations = [self.learn(view, lit, forget=False) for view, lit in zip(views, known, strict=True)]
-        for view, observation, lit, needed in zip(views, observations, known, doubtful, strict=True):
-            if needed and observation is not None:
-                self._measure_again(view, observation, lit)
+        updates = [self.learn(view, lit, forget=False) for view, lit in zip(views, known, strict=True)]
+        for view, update, lit, needed in zip(views, updates, known, doubtful, strict=True):
+            if needed and update is not None:
+                self._measure_again(view, update, lit)
 
     def _dark_light(self, views: Sequence[View]) -> Float32Array:
         """(C, S) light of the strips where nothing is lit."""
@@ -404,7 +403,7 @@ class TrackedScreen:
                 inside.append(view.pose.map.inside)
         return known_picture.dark_light(lights, dark, inside, self._begun_with[1])
 
-    def _measure_again(self, view: View, own: known_picture.Observation, known: Float32Array) -> None:
+    def _measure_again(self, view: View, own: Float32Array, known: Float32Array) -> None:
         """Measure a frame by the picture, less what the frame itself has shown of it."""
         assert view.light is not None
         assert view.pose is not None

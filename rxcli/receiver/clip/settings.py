@@ -35,8 +35,8 @@ class ClipSettings:
     #: How much of its shape an outline may lose or win between two looks, in screen widths.
     bent_outline: float = 0.012
     #: Frames from which the picture is learned one by one, and how often from then on.
-    first_updates: int = 12
-    update_every: int = 6
+    first_updates: int = 6
+    update_every: int = 12
     #: Columns decided worse than this many times the foreseen variance do not fit what is known; and of a screen
     #: that is taken to rest: while it does 0.8 to 1.3 times, 2 pixels away 2 times and more.
     misfit: float = 40.0
@@ -72,7 +72,7 @@ class ClipSettings:
     unlike_evidence: float = 4.0
     #: Spacing of the pixels compared with the frame before; minimum change from row to row, grey levels of 255, and
     #: share of it by which a repeated frame may differ.
-    same_step: int = 15
+    same_step: int = 31
     same_contrast: float = 3.0
     same_share: float = 0.25
     #: How much longer than from one frame to the next a readout may seem to take: time stamps are rounded.
@@ -92,8 +92,7 @@ class ClipSettings:
     #: Dark columns are tried all the same in one frame in this many.
     try_dark_every: int = 30
 
-    #: Corners of two searches that differ by less than this, in screen widths, agree; searches where they do not.
-    outlines_agree: float = 0.003
+    #: Frames that are searched for the outline where the first shows no plain packets.
     max_searches: int = 5
 
     #: A frame that shows fewer packets than this finds its clock with others; one that shows more does better alone.

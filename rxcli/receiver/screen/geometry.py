@@ -230,16 +230,10 @@ def _interpolated(places: FloatArray | IntArray, known: FloatArray, *values: Flo
     line = np.arange(len(known))[:, None]
     distance = max(known.max(), places.max()) - min(known.min(), places.min()) + 1
     found = np.searchsorted((known + line * distance).ravel(), (places + line * distance).ravel(), side="right")
-    right = np.clip(found.reshape(places.shape) - line * n_known, 1, n_known - 1)
-    left = right - 1
-
-    def taken(of: FloatArray, index: IntArray) -> FloatArray:
-        return np.take_along_axis(of, index, axis=1)
-
-    before = taken(known, left)
-    part = np.clip((places - before) / np.maximum(taken(known, right) - before, TINY), 0, 1)
-    lows = [taken(of, left) for of in values]
-    return [low + (taken(of, right) - low) * part for low, of in zip(lows, values, strict=True)]
+    right = np.clip(found.reshape(places.shape), line * n_known + 1, (line + 1) * n_known - 1)
+    (before, after), *ends = [(flat.take(right - 1), flat.take(right)) for flat in map(np.ravel, (known, *values))]
+    part = np.clip((places - before) / np.maximum(after - before, TINY), 0, 1)
+    return [low + (high - low) * part for low, high in ends]
 
 
 def rows_elsewhere(rows: FloatArray, here: FloatArray, there: FloatArray) -> Float32Array:

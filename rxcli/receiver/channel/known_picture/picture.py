@@ -112,19 +112,23 @@ class KnownPicture:
         moved._system = moved._of_one = moved._placed = None
         return moved
 
-    def learn(self, observation: Observation, *, forget: bool = True) -> None:
-        """Update the picture by a frame with known slots; with `forget`, earlier frames lose some weight."""
-        keep = np.float32(SETTINGS.memory_share if forget else 1.0)
-        self._sums = self._sums * keep + self._update_of(observation)
-        self._system = self._made = self._placed = None
+    def learn(self, observation: Observation, *, forget: bool = True) -> Float32Array:
+        """Update the picture by a frame with known slots, and return the update.
 
-    def without(self, observation: Observation) -> KnownPicture:
-        """The picture without an observation, which was added with nothing forgotten since.
+        With `forget`, earlier frames lose some weight.
+        """
+        update = self._update_of(observation)
+        self._sums = self._sums * np.float32(SETTINGS.memory_share if forget else 1.0) + update
+        self._system = self._made = self._placed = None
+        return update
+
+    def without(self, update: Float32Array) -> KnownPicture:
+        """The picture without an update that `learn` returned, with nothing forgotten since.
 
         A picture that contains a frame's own light would confirm its decisions, wrong or right.
         """
         rest = copy(self)
-        rest._sums = self._sums - self._update_of(observation)
+        rest._sums = self._sums - update
         np.maximum(rest._sums[1:], 0, out=rest._sums[1:])
         rest._system = rest._made = rest._placed = None
         rest._excess = self._excess.copy()
@@ -292,8 +296,9 @@ def _error_correlation(error: Float32Array, precision: Float32Array, rows_per_sl
 
 def _with_neighbours(columns: Float32Array, edge: float = 0.0) -> Float32Array:
     """(C, 3, R): each column between its neighbours."""
-    padded = np.pad(columns, ((1, 1), (0, 0)), constant_values=edge)
-    return np.stack([padded[:-2], padded[1:-1], padded[2:]], axis=1)
+    out = np.full((len(columns), 3, columns.shape[1]), edge, np.float32)
+    out[1:, 0], out[:, 1], out[:-1, 2] = columns[:-1], columns, columns[1:]
+    return out
 
 
 def _around(values: Float32Array, rows_per_slot: float) -> Float32Array:

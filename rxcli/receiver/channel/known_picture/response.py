@@ -15,6 +15,8 @@ from rxcli.types import Float32Array, FloatArray, IntArray
 #: Approximate number of values from which a response is fitted; and the golden ratio, whose multiples are spread evenly
 #: modulo 1.
 _SAMPLES_OF_RESPONSE, _GOLDEN = 2000, 0.6180339887
+#: (2, 5) lower and upper limits of centre, side, offset, lateness and drift.
+_BOUNDS = np.transpose(SETTINGS.response_bounds)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,9 +76,8 @@ def fit_response(observed: ColumnLight, slots: Exposures) -> Fit:
     weight = float(precision.sum()) + 1e-9
     normal, right = weighted @ parts.T / weight, weighted @ value / weight
     # Regularised towards no blur.
-    usual = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
-    fitted = usual + np.linalg.solve(normal + SETTINGS.response_ridge * np.eye(len(usual)), right - normal @ usual)
-    least, most = np.array([*SETTINGS.response_bounds, (-SETTINGS.max_shift_slots, SETTINGS.max_shift_slots)]).T
-    late, drift = np.clip(fitted[3:] / max(fitted[0] + 2 * fitted[1], least[0]), least[3], most[3])
-    response = Response(*np.clip(fitted[:3], least[:3], most[:3]).tolist())
-    return Fit(response, float(late), float(drift))
+    fitted = np.linalg.solve(normal + SETTINGS.response_ridge * np.eye(len(normal)), right - normal[:, 0])
+    fitted[0] += 1
+    fitted[3:] /= max(fitted[0] + 2 * fitted[1], SETTINGS.response_bounds[0][0])
+    *response, late, drift = np.clip(fitted, *_BOUNDS).tolist()
+    return Fit(Response(*response), late, drift)
