@@ -1,8 +1,9 @@
 """The first frames of a clip: they agree on where the screen is, and the surest of their cameras counts.
 
-The strips of a whole clip lie where its first frame has the screen. Plain packets there settle the outline. A frame
-without them may be wrong by many pixels: then the texture of the picture gives the motion of the screen from the first
-frame to the next ones, the outlines found in these are carried back, and their median is used.
+The strips of a whole clip lie where its first frame has the screen, and the outline of a single frame may be wrong by
+many pixels. The texture of the picture gives the motion of the screen from the first frame to the next ones. The
+outlines found in these are carried back, and their median is used. Where the first frame shows plain packets, the next
+ones are not searched: the outline is followed.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 
 from rxcli.receiver.clip.camera import ClipCamera, Located
 from rxcli.receiver.clip.common_clock import shows_little
+from rxcli.receiver.clip.scene import followed_outline
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.screen.registration import ScreenTexture
@@ -26,7 +28,7 @@ class FirstFrames:
     frames: tuple[Frame, ...]
     #: Where the screen is in the first of them, with the surest of their cameras.
     located: Located
-    #: Of the screen; None where its outline is sure, or there is nothing to compare an outline with.
+    #: Of the screen; None where there is nothing to compare an outline with, or the user gave the corners.
     texture: ScreenTexture | None
     #: Corners (4, 2) that were found in each frame, carried back to the first, less those found there.
     differences: tuple[FloatArray, ...]
@@ -38,8 +40,7 @@ class FirstFrames:
         if isinstance(located, Failure):
             return located
         corners = located.context.corners
-        is_sure = camera.options.corners is not None or located.is_plain
-        texture = None if is_sure else ScreenTexture(frame, corners, None)
+        texture = None if camera.options.corners is not None else ScreenTexture(frame, corners, None)
         return cls((frame,), located, texture, (np.zeros_like(corners),))
 
     @property
@@ -72,23 +73,27 @@ class FirstFrames:
 
     def with_frame(self, frame: Frame, camera: ClipCamera) -> FirstFrames:
         """These frames and one more; it is searched for its outline and its camera as far as they are unsure."""
-        longer, located = replace(self, frames=(*self.frames, frame)), self.located
+        longer, located, found = replace(self, frames=(*self.frames, frame)), self.located, None
         unsure = located.camera_error == np.inf or (located.camera_error > 0 and self.shows_little)
-        if self._agree and not unsure:
-            return longer
-        found = (camera if unsure else replace(camera, context=located.context)).locate(frame, Timer())
-        longer = replace(longer, located=located.with_surer_camera(found) if unsure else located)
+        if unsure or not (self._agree or located.is_plain):
+            found = (camera if unsure else replace(camera, context=located.context)).locate(frame, Timer())
+            longer = replace(longer, located=located.with_surer_camera(found) if unsure else located)
         return longer if self._agree else longer._compared(frame, found)
 
-    def _compared(self, frame: Frame, found: Located | Failure) -> FirstFrames:
-        """The same with the outline found in a further frame, less its motion since the first."""
+    def _compared(self, frame: Frame, found: Located | Failure | None) -> FirstFrames:
+        """The same with the outline of a further frame, less its motion since the first; None: it is followed."""
         assert self.texture is not None
         moved = self.texture.find(frame)
         if not moved.is_precise:
             moved = self.texture.with_outline(moved, self.located.context.corners)
-        if found.outline is None or not moved.fits:
+        if found is None:
+            start = moved.corners + self.differences[-1]
+            corners = followed_outline(frame, start, self.located.context.screens[0])
+        else:
+            corners = None if found.outline is None else found.outline.corners
+        if corners is None or not moved.fits:
             return replace(self, texture=None)
-        difference = found.outline.corners - moved.corners
+        difference = corners - moved.corners
         if np.abs(difference).max() > self._width / 2:
             return replace(self, texture=None)
         self.texture.learn(frame, moved)

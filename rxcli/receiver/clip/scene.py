@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.profiles import ScreenProfile
 from rxcli.receiver import plane
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.channel import SlotLikelihoods, known_picture
@@ -138,18 +139,12 @@ class TrackedScreen:
 
         It is looked for in every other frame, and less often as long as it stays where it is and nothing is a surprise.
         """
-        from rxcli.receiver.screen.find import ColumnLayout, follow_outline
-
         self._n_imprecise += 1
         if self._n_imprecise % (SETTINGS.look_every if self._n_still >= SETTINGS.still_looks and not surprised else 2):
             return None
-        stored, order = _stored_order(corners)
-        screen = self._begun_with[0].screen
-        layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
-        found = follow_outline(plane.read_plane(frame), stored, layout)
-        if found is None:
+        outline = followed_outline(frame, corners, self._begun_with[0].screen)
+        if outline is None:
             return None
-        outline = found[order]
         moved = outline - corners
         if np.abs(moved).max() > 2 * SETTINGS.outline_reach * self._width:
             return None
@@ -418,6 +413,16 @@ class TrackedScreen:
             view.flat, clock, _, found = refined
             view.snr = found.snr
             view.bursts = replace(view.bursts, clock=replace(clock, burst=burst), metrics=found.metrics, tracked=True)
+
+
+def followed_outline(frame: Frame, corners: FloatArray, screen: ScreenProfile) -> FloatArray | None:
+    """Corners (4, 2) of a screen by its outline, which is looked for near `corners`; None if it is not there."""
+    from rxcli.receiver.screen.find import ColumnLayout, follow_outline
+
+    stored, order = _stored_order(corners)
+    layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
+    found = follow_outline(plane.read_plane(frame), stored, layout)
+    return None if found is None else found[order]
 
 
 def _retimed(clock: Clock, rows: FloatArray, fit: known_picture.Fit) -> Clock:

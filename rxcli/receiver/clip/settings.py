@@ -35,7 +35,7 @@ class ClipSettings:
     #: How much of its shape an outline may lose or win between two looks, in screen widths.
     bent_outline: float = 0.012
     #: Frames from which the picture is learned one by one, and how often from then on.
-    first_updates: int = 6
+    first_updates: int = 12
     update_every: int = 12
     #: Columns decided worse than this many times the foreseen variance do not fit what is known; and of a screen
     #: that is taken to rest: while it does 0.8 to 1.3 times, 2 pixels away 2 times and more.
@@ -92,7 +92,7 @@ class ClipSettings:
     #: Dark columns are tried all the same in one frame in this many.
     try_dark_every: int = 30
 
-    #: Frames that are searched for the outline where the first shows no plain packets.
+    #: First frames whose outlines are compared.
     max_searches: int = 5
 
     #: A frame that shows fewer packets than this finds its clock with others; one that shows more does better alone.
