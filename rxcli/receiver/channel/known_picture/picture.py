@@ -145,10 +145,13 @@ class KnownPicture:
         doubt = self._crosstalk @ (1 - _with_neighbours(observation.trust, 1.0))
         inside = self._inside if placement is None else placement.inside.astype(np.float32)
         # If little light was predicted, the observed light may come from other slots.
-        power = expected * expected
-        known = power / (power + np.float32(SETTINGS.prediction_error) + np.float32(SETTINGS.uncertain_error) * doubt)
-        weighted = expected * (known * known) * np.maximum(1 - np.float32(SETTINGS.doubt_weight) * doubt, 0) * inside
+        known = expected * expected
+        known /= known + np.float32(SETTINGS.prediction_error) + np.float32(SETTINGS.uncertain_error) * doubt
         light = observation.light - self._black_level
+        weighted = expected * known
+        weighted *= known
+        weighted *= np.maximum(1 - np.float32(SETTINGS.doubt_weight) * doubt, 0)
+        weighted *= inside
         sums = np.stack([weighted * light, weighted * expected, np.float32(0.5) * inside, inside * light])
         row = observation.frame_row
         return sums if row is None else np.stack([_resampled(values, row, beyond=True) for values in sums])
