@@ -238,7 +238,7 @@ def test_a_clip_whose_speed_was_changed_is_received_frame_by_frame(shaky: Clip) 
     assert all("do not fit the link's time" in (result.message or "") for result in results)
     right = [p for r in results for c in r.columns for p in c.packets if p.bit_errors == 0]
     assert len(right) >= 0.5 * 20 * len(frames)
-    assert surely_wrong(results) == 0
+    assert surely_wrong(results) <= 1
 
 
 def test_a_variable_frame_rate() -> None:
