@@ -256,7 +256,7 @@ def _possible_combs(strips: Strips, sigma: float, part: int = 0) -> list[Comb]:
 
 def _stands_out(strips: Strips, grid: Grid, min_contrast: float = SETTINGS.min_contrast) -> bool:
     """Whether borders half a column further on explain less, by more than chance."""
-    by_chance = grid.explained / np.sqrt(strips.n_rows * SETTINGS.n_windows)
+    by_chance = grid.explained / np.sqrt(strips.picture_rows)
     return bool(grid.contrast > min_contrast * by_chance)
 
 

@@ -63,6 +63,11 @@ class Strips:
         return len(self.changes) // self.n_parts
 
     @property
+    def picture_rows(self) -> float:
+        """Independent rows of the picture."""
+        return self.n_rows * self.height / (2 * self.half_height * self.width)
+
+    @property
     def step(self) -> float:
         """Distance of two neighbouring strips, picture widths."""
         return float(self.raw_x[0, 1] - self.raw_x[0, 0])
@@ -108,12 +113,13 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
         n_parts: parts of the width with strips of their own.
     """
     light, x = _light_of_strips(plane, n_parts)
-    short, n_windows = _short_rows(light), SETTINGS.n_windows
-    means = _means_of_rows(light, short)
+    # Windows show no difference between columns and those turned by one column a window, so narrow ones need more.
+    short, n_windows = _short_rows(light), SETTINGS.n_windows if n_parts == 1 else 2 * SETTINGS.n_windows
+    means = _means_of_rows(light, short, n_windows)
     rows = means.shape[1] // n_windows
     middles = (np.arange(n_windows) + 0.5) * rows * short - 0.5
     points = np.stack(np.meshgrid(x, middles), axis=-1)
-    changes, lit, noise = _without_row_noise(_windows(_band_passed(light, means, short)))
+    changes, lit, noise = _without_row_noise(_windows(_band_passed(light, means, short), n_windows))
 
     def parted(values: NDArray[_Real]) -> NDArray[_Real]:
         """(W, S, ...) as (parts x W, S / parts, ...)."""
@@ -173,11 +179,11 @@ def _lit_coherence(strips: Strips, widths: float) -> float:
     return float((strips.coherence(distance) * share).sum() / (np.square(share).sum() + TINY))
 
 
-def _means_of_rows(light: Float32Array, short: int) -> Float32Array:
+def _means_of_rows(light: Float32Array, short: int, n_windows: int) -> Float32Array:
     """(S, R) means over `short` rows of light (S, rows), R a multiple of the number of windows."""
     import cv2
 
-    n = light.shape[1] // (short * SETTINGS.n_windows) * SETTINGS.n_windows
+    n = light.shape[1] // (short * n_windows) * n_windows
     return np.asarray(cv2.resize(light[:, : n * short], (n, len(light)), interpolation=cv2.INTER_AREA), np.float32)
 
 
@@ -205,9 +211,9 @@ def _short_rows(light: Float32Array) -> int:
     return int(np.clip(round(SETTINGS.short_share * half_lag), SETTINGS.min_short_rows, max_rows))
 
 
-def _windows(band: Float32Array) -> Float32Array:
+def _windows(band: Float32Array, n_windows: int) -> Float32Array:
     """(W, S, R) windows of rows, each strip scaled to a mean square of one."""
-    changes = np.ascontiguousarray(band.reshape(len(band), SETTINGS.n_windows, -1).swapaxes(0, 1))
+    changes = np.ascontiguousarray(band.reshape(len(band), n_windows, -1).swapaxes(0, 1))
     power = np.einsum("wsr,wsr->ws", changes, changes) / np.float32(changes.shape[2])
     changes /= (np.sqrt(power) + np.float32(TINY))[..., None]
     return changes

@@ -359,6 +359,13 @@ def test_a_hundred_columns_are_found_in_a_film_with_bars() -> None:
     np.testing.assert_allclose(candidate.corners[0][:, 1], NARROW_CORNERS[:, 1], atol=25)
 
 
+def test_a_turn_of_a_narrow_column_between_two_windows_of_rows_is_not_taken_for_none() -> None:
+    """In a high picture a sixteenth of the rows is high enough for columns to be turned by one of them within it."""
+    corners = NARROW_CORNERS + np.array([0.0, 500.0])
+    high = draw("white", corners, n_columns=100, rows_per_slot=5.0, seed=5, size=(2100, NARROW_WIDTH))
+    assert np.abs(apart(find_outlines(plane_of(high), [WIDE, NARROW])[0], corners)).max() < 0.35
+
+
 def test_wide_columns_are_not_taken_for_narrow_ones() -> None:
     assert shows_narrow_columns(read_strips(plane_of(narrow_film())))
     assert not shows_narrow_columns(read_strips(drawn("film")))
