@@ -16,7 +16,7 @@ DATA = BASE | {"rxcli.types", "rxcli.protocol", "rxcli.profiles"}
 #: What every stage may stand on beside the data model.
 GROUND = DATA | {"rxcli.numerics", "rxcli.receiver.light"}
 #: Rooms of the receiver that turn one thing into the next, and know nothing of one another.
-STAGES = ("plane", "screen", "sampling", "camera", "sync", "channel", "decode")
+STAGES = ("plane", "screen", "camera", "sync", "channel", "decode")
 #: Rooms and files of `rxcli/`: the listing alone shows the way of the data.
 MAX_FOLDERS, MAX_FILES = 9, 9
 #: Too heavy to be loaded by a module that does not need it at once (milliseconds each on import: 70 to 1000).

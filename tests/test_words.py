@@ -49,7 +49,7 @@ SOURCES = (
     *("lab/benchmark", "lab/simulate"),
 )
 #: Places whose prose is read, but not yet their names; one file holds a word in the text of a test picture.
-PROSE_ONLY = ("lab/training", "receiver/camera", "receiver/sampling")
+PROSE_ONLY = ("lab/training", "receiver/camera")
 TEXT_IN_A_PICTURE = "lab/simulate/pictures.py"
 PAGES = (
     *("README.md", "sample_frames/README.md", "docs/README.md", "docs/architecture.md", "docs/auto_encoder.md"),

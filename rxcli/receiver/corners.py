@@ -69,7 +69,7 @@ def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
     def outline(candidate: OutlineCandidate) -> Outline:
         is_usual = single_wide and not candidate.layout.is_narrow
         found = Outline(
-            candidate.corners[0],
+            candidate.corners,
             inferred=candidate.unlit_sides,
             log_odds=candidate.log_odds,
             family=candidate.layout.n_columns,

@@ -16,7 +16,7 @@ from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import Pose, View
 from rxcli.receiver.context import Camera, FrameContext, Timer
 from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
-from rxcli.receiver.sampling import tracked
+from rxcli.receiver.plane import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
 from rxcli.receiver.sync import clock as sync
@@ -163,7 +163,8 @@ class TrackedScreen:
     def _move(self, frame: Frame, found: Registration) -> None:
         n_columns, n_strips, _ = self._first_pose.map.inside.shape
         corners = found.corners
-        outlines, middles = geometry.quick_outlines(corners, n_columns, n_strips, frame.width, frame.height, self._lens)
+        outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, self._lens)
+        middles = geometry.column_middles(corners, n_columns, self._lens)
         sd = float(np.sqrt(np.diag(found.covariance)[1::2].max()))
         outlines = replace(outlines, inside=_less_ends(outlines.inside, SETTINGS.min_end_rows + sd))
         strips = tracked.moved_map(self._first_pose.map, outlines)

@@ -8,7 +8,7 @@ from typing import Any
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.channel.known_picture import ColumnLight, Placement
 from rxcli.receiver.context import FrameContext
-from rxcli.receiver.sampling import tracked
+from rxcli.receiver.plane import tracked
 from rxcli.receiver.sync.tracking import FrameBursts
 from rxcli.types import Float32Array, FloatArray, FrameResult, IntArray
 

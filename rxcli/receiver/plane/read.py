@@ -21,7 +21,7 @@ from rxcli.receiver.plane.settings import SETTINGS
 from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
 
 #: Rows read at a time, chosen to fit the processor's cache.
-_BAND_ROWS = 64
+BAND_ROWS = 64
 
 
 def read_plane(frame: Frame) -> LightPlane:
@@ -32,9 +32,9 @@ def read_plane(frame: Frame) -> LightPlane:
     cell_px = _cell_px(width, 1)
     n_cells = width // cell_px
     sums = np.zeros((n_cells + 1, height), np.float32)
-    for top in range(0, height, _BAND_ROWS):
-        band = np.ascontiguousarray(frame.pixels[top : top + _BAND_ROWS, : n_cells * cell_px])
-        sums[1:, top : top + _BAND_ROWS] = _cells(band, cell_px).T
+    for top in range(0, height, BAND_ROWS):
+        band = frame.pixels[top : top + BAND_ROWS, : n_cells * cell_px]
+        sums[1:, top : top + BAND_ROWS] = cells_of(band, cell_px).T
     return LightPlane(_run(sums), cell_px, width, frame.black, frame.white, is_linear=frame.linear)
 
 
@@ -68,8 +68,10 @@ def _run(sums: Float32Array) -> Float32Array:
     return sums
 
 
-def _cells(band: NDArray[Any], cell_px: int) -> NDArray[Any]:
+def cells_of(band: NDArray[Any], cell_px: int) -> NDArray[Any]:
     """Sums (rows, n) of `cell_px` neighbouring integers; `cell_px` is a power of two, and two lanes share a word."""
+    if band.strides[1] != band.itemsize:  # Pixels do not lie side by side.
+        band = np.ascontiguousarray(band)
     while cell_px > 1:
         half = 8 * band.dtype.itemsize
         pairs = band.view(f"u{2 * band.dtype.itemsize}")
@@ -87,8 +89,8 @@ def _read_mosaic(frame: Frame, mosaic: Mosaic) -> LightPlane:
     n_cells = width // cell_px
     sums = np.zeros((n_cells + 1, height), np.float32)
     for phase in range(min(period, height)):
-        for top in range(phase, height, _BAND_ROWS * period):
-            rows = slice(top, top + _BAND_ROWS * period, period)
+        for top in range(phase, height, BAND_ROWS * period):
+            rows = slice(top, top + BAND_ROWS * period, period)
             runs = frame.pixels[rows, : n_cells * cell_px].astype(np.float32).reshape(-1, n_cells, cell_px)
             sums[1:, rows] = (runs @ weights[phase] - offsets[phase] * np.float32(cell_px)).T
     if not is_complete:

@@ -54,9 +54,8 @@ class ColumnLayout:
 class OutlineCandidate:
     """A candidate position of the screen."""
 
-    #: (4, 2) pixels of the stored picture, clockwise from the screen's top left there: one for each candidate extent of
-    #: its rows, likeliest first.
-    corners: tuple[FloatArray, ...]
+    #: (4, 2) pixels of the stored picture, clockwise from the screen's top left there.
+    corners: FloatArray
     #: Strips of the picture on which it was found.
     strips: Strips
     #: Columns are numbered from the screen's first.
@@ -66,7 +65,7 @@ class OutlineCandidate:
     log_odds: float
     #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
     fills: bool
-    #: Sides of the stored picture at which no light shows with the likeliest rows.
+    #: Sides of the stored picture at which no light shows.
     unlit_sides: tuple[str, ...]
 
 
@@ -160,11 +159,8 @@ def follow_outline(plane: LightPlane, corners: FloatArray, layout: ColumnLayout)
     if not _stands_out(strips, grid):
         return None
     light = predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), layout.sigma)
-    flat, ends = find_rows(strips, light, grid, n, layout.aspect)
-    if len(ends) > 1:  # Bars at its top or bottom: the rows are where they were.
-        before = flat.along_flat(*grid.flat(corners))
-        ends = [(float(before[:2].mean()), float(before[2:].mean()))]
-    return flat.corners(ends[0])
+    flat, ends, has_bars = find_rows(strips, light, grid, n, layout.aspect)
+    return flat.corners(flat.ends_of(corners) if has_bars else ends)  # With bars the rows are where they were.
 
 
 def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid | None:
@@ -274,11 +270,11 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> li
         # Where the first column is plain, light beyond the screen's ends does not come from it.
         n_columns = layout.n_columns if is_plain else None
         own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, SETTINGS.last_steps, n_columns=n_columns)
-        plane, ends = find_rows(strips, light, own, layout.n_columns, layout.aspect)
+        plane, ends, has_bars = find_rows(strips, light, own, layout.n_columns, layout.aspect)
         for number, log_odds in zip(start.columns[likely].tolist(), start.log_odds[likely].tolist(), strict=True):
-            corners = tuple(plane.corners(extent, number - best) for extent in ends)
+            corners = plane.corners(ends, number - best)
             lit = (profile.ends[0] - number, number + layout.n_columns - profile.ends[1])
-            unlit = _unlit_sides(corners[0], lit, len(ends) > 1, (strips.width, strips.height))
+            unlit = _unlit_sides(corners, lit, has_bars, (strips.width, strips.height))
             counted, odds_lost = own.shifted(number - best), log_odds - likeliest
             found.append(OutlineCandidate(corners, strips, counted, layout, odds_lost, start.fills, unlit))
     return sorted(found, key=lambda candidate: -candidate.log_odds)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import TINY
 from rxcli.profiles import LensModel
-from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray, Lens, Outlines
+from rxcli.types import Float32Array, FloatArray, IntArray, Lens, Outlines
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 
@@ -24,7 +24,8 @@ _VIEWER_CORNERS = {1: (0, 1, 2, 3), 2: (1, 0, 3, 2), 3: (2, 3, 0, 1), 4: (3, 2, 
 _OVERHANG = 0.02
 #: Sides of a picture, in the order of its corners: side i goes from corner i to corner i + 1.
 SIDE_NAMES = ("top", "right", "bottom", "left")
-_OUTLINE_POINTS, _MIDDLE_POINTS = 65, 33
+#: Points down the screen through which borders of columns are drawn.
+_N_POINTS = 65
 #: Maximum displacement of a point by a lens, in focal lengths.
 _LARGEST_MOVE = 10.0
 #: The inverse of the lens has converged when a step moves every point by less than this many pixels.
@@ -128,15 +129,11 @@ def screen_to_picture(points: FloatArray, corners: FloatArray, lens: Lens | None
 
 
 def column_outlines(
-    corners: FloatArray,
-    n_columns: int,
-    n_strips: int,
-    width: int,
-    height: int,
-    lens: Lens | None = None,
-    columns: slice | None = None,
+    corners: FloatArray, n_columns: int, n_strips: int, width: int, height: int, lens: Lens | None = None
 ) -> Outlines:
     """Outlines of `n_columns` columns of `n_strips` strips on a picture of `width` x `height`.
+
+    Strips lie evenly between the columns' borders, which errs by hundredths of a strip.
 
     Args:
         corners: (4, 2) pixels of the stored picture, the viewer's top-left first.
@@ -145,40 +142,18 @@ def column_outlines(
         width: pixels a row.
         height: rows.
         lens: lens model of the picture.
-        columns: which of them to outline, with a start and a stop; all by default.
     """
-    first_column, n_outlined = (0, n_columns) if columns is None else (columns.start, columns.stop - columns.start)
-    u = np.linspace(0, 1, n_columns * n_strips + 1)[first_column * n_strips :][: n_outlined * n_strips + 1]
-    v = np.linspace(-_OVERHANG, 1 + _OVERHANG, _OUTLINE_POINTS)
-    points = screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens)
-    return _outlined(points, v, n_strips, 1, _row_range(corners, height), width, lens)
-
-
-def quick_outlines(
-    corners: FloatArray, n_columns: int, n_strips: int, width: int, height: int, lens: Lens | None
-) -> tuple[Outlines, FloatArray]:
-    """As `column_outlines` and `column_middles`, from the columns' borders alone.
-
-    Strips lie evenly between the borders: off by hundredths of a strip.
-    Arguments as for `column_outlines`.
-    """
-    u, v = np.linspace(0, 1, n_columns + 1), np.linspace(-_OVERHANG, 1 + _OVERHANG, _MIDDLE_POINTS)
-    points = screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens)
-    outlines = _outlined(points, v, n_strips, n_strips, _row_range(corners, height), width, lens)
-    return outlines, (points[1:, :, 1] + points[:-1, :, 1]) / 2
-
-
-def _outlined(
-    points: FloatArray, v: FloatArray, n_strips: int, finer: int, ends: tuple[int, int], width: int, lens: Lens | None
-) -> Outlines:
-    """Outlines of strips, where every `finer`-th edge passes through points (n, v, 2); `ends` are their rows."""
-    top, bottom = ends
-    rows = np.arange(top, bottom + 1)
+    points, v = _down_the_screen(np.linspace(0, 1, n_columns + 1), corners, lens)
+    top = int(np.clip(np.floor(corners[:, 1].min()), 0, height - 1))
+    rows = np.arange(top, int(np.clip(np.ceil(corners[:, 1].max()), top, height - 1)) + 1)
     knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
-    knot_x, knot_v = (_finer(values, finer) for values in _edges_at(points, v, knots))
+    step = 1 if points[0, -1, 1] > points[0, 0, 1] else -1  # On a screen upside down y falls with v.
+    y, x = points[:, ::step, 1], points[:, ::step, 0]
+    borders = _interpolated(np.broadcast_to(knots, (len(y), knots.size)), y, x, np.broadcast_to(v[::step], y.shape))
+    knot_x, knot_v = (_divided(values, n_strips) for values in borders)
     edges_x = _between_knots(knot_x.astype(np.float32), knots, rows)
-    middle_v = (knot_v[1:] + knot_v[:-1]) / 2
-    inside = _rows_between(middle_v, knots, rows, 0.0, 1.0)
+    middle_v = _between_knots(((knot_v[1:] + knot_v[:-1]) / 2).astype(np.float32), knots, rows)
+    inside = (middle_v > 0) & (middle_v < 1)
     if knot_x.min() < 0 or knot_x.max() > width - 1:
         in_picture = (edges_x >= 0) & (edges_x <= width - 1)
         inside &= in_picture[1:] & in_picture[:-1]
@@ -191,32 +166,18 @@ def _outlined(
 
 def column_middles(corners: FloatArray, n_columns: int, lens: Lens | None) -> FloatArray:
     """(C, n) rows of the same points down the middle of each column, from a little above the screen to below it."""
-    u = (np.arange(n_columns) + 0.5) / n_columns
-    v = np.linspace(-_OVERHANG, 1 + _OVERHANG, _MIDDLE_POINTS)
-    return screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens)[..., 1]
+    return _down_the_screen((np.arange(n_columns) + 0.5) / n_columns, corners, lens)[0][..., 1]
 
 
-def _row_range(corners: FloatArray, height: int) -> tuple[int, int]:
-    top = int(np.clip(np.floor(corners[:, 1].min()), 0, height - 1))
-    bottom = int(np.clip(np.ceil(corners[:, 1].max()), top, height - 1))
-    return top, bottom
+def _down_the_screen(u: FloatArray, corners: FloatArray, lens: Lens | None) -> tuple[FloatArray, FloatArray]:
+    """Pixels (n, m, 2) of points down the screen at each u (n,), from a little above it to below it, and their v."""
+    v = np.linspace(-_OVERHANG, 1 + _OVERHANG, _N_POINTS)
+    return screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens), v
 
 
-def _edges_at(points: FloatArray, v: FloatArray, knots: IntArray) -> tuple[FloatArray, FloatArray]:
-    """x and v of every edge (n_edges, n_points, 2) on the rows `knots`; a screen upside down has y falling with v."""
-    step = 1 if points[0, -1, 1] > points[0, 0, 1] else -1
-    edges = points[:, ::step]
-    along = np.broadcast_to(v[::step], edges.shape[:2])
-    x, along = _interpolated(np.broadcast_to(knots, (len(edges), knots.size)), edges[..., 1], edges[..., 0], along)
-    return x, along
-
-
-def _finer(values: FloatArray, parts: int) -> FloatArray:
+def _divided(values: FloatArray, parts: int) -> FloatArray:
     """Divide the distance between adjacent lines of values (n, K) into equal parts: (parts * (n - 1) + 1, K)."""
-    if parts == 1:
-        return values
-    share = np.arange(parts)[:, None] / parts
-    between = values[:-1, None] + (values[1:] - values[:-1])[:, None] * share
+    between = values[:-1, None] + np.diff(values, axis=0)[:, None] * (np.arange(parts)[:, None] / parts)
     return np.concatenate([between.reshape(-1, values.shape[1]), values[-1:]])
 
 
@@ -263,15 +224,6 @@ def _between_knots(values: NDArray[_Real], knots: IntArray, rows: IntArray) -> N
     if between.shape[1] < rows.size:
         between = np.concatenate([between, values[:, -1:]], axis=1)
     return np.asarray(between, values.dtype)
-
-
-def _rows_between(values: FloatArray, knots: IntArray, rows: IntArray, low: float, high: float) -> BoolArray:
-    """(n, rows) where values (n, knots), monotonic along the knots, lie strictly between `low` and `high`."""
-    step = 1 if values[0, -1] > values[0, 0] else -1
-    lines, limits = values[:, ::step], np.broadcast_to(np.array([low, high]), (len(values), 2))
-    (ends,) = _interpolated(limits, lines, np.broadcast_to(knots[::step].astype(np.float64), lines.shape))
-    ends = np.where(limits < lines[:, :1], -np.inf * step, np.where(limits > lines[:, -1:], np.inf * step, ends))
-    return np.asarray((rows > ends.min(axis=1)[:, None]) & (rows < ends.max(axis=1)[:, None]))
 
 
 def _sensor_rows(edges_x: FloatArray, knots: IntArray, lens: Lens) -> FloatArray:

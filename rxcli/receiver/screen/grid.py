@@ -63,9 +63,7 @@ class Grid:
 
     def flat(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Offsets of (..., 2) pixels from the picture's middle in picture widths, with lens distortion removed."""
-        x, y = flat_places(points, self.width, self.height, self.lens)
-        scale = 1 + self.numbers[5] * (x * x + y * y)
-        return x * scale, y * scale
+        return straightened(self.numbers[5], *flat_places(points, self.width, self.height, self.lens))
 
     def pixels_of(self, flat: FloatArray) -> FloatArray:
         """(n, 2) pixels of (n, 2) offsets, the inverse of `flat`."""
@@ -108,11 +106,16 @@ def grid_through(grid: Grid, x: FloatArray, y: FloatArray, u: FloatArray) -> Gri
     return replace(grid, numbers=numbers)
 
 
+def straightened(radial: float, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Offsets from the picture's middle with the radial distortion of a grid removed."""
+    scale = 1 + radial * (x * x + y * y)
+    return x * scale, y * scale
+
+
 def columns_at(numbers: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     """(...) columns at (...) offsets from the picture's middle, see the module's text."""
     u0, a, b, g, h, radial = numbers
-    scale = 1 + radial * (x * x + y * y)
-    x, y = x * scale, y * scale
+    x, y = straightened(radial, x, y)
     return np.asarray(u0 + (a * x + b * y) / (1 + g * x + h * y))
 
 
@@ -120,7 +123,7 @@ def grid_slopes(numbers: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray
     """(6, ...) derivatives of the columns by the six numbers."""
     _, a, b, g, h, radial = numbers
     r2 = x * x + y * y
-    x, y = x * (1 + radial * r2), y * (1 + radial * r2)
+    x, y = straightened(radial, x, y)
     below = 1 + g * x + h * y
     u = (a * x + b * y) / below
     by_x, by_y = (a - u * g) / below, (b - u * h) / below

@@ -109,5 +109,4 @@ def _waves(
 def _corners(grid: Grid, before: FloatArray, n_columns: int, aspect: float) -> FloatArray:
     """Corners on the outer borders of a grid; top and bottom at right angles to its columns, as high as they were."""
     plane = Plane.through(grid, n_columns, aspect, float(before[:, 1].mean()))
-    along = plane.along_flat(*grid.flat(before))
-    return plane.corners((float(along[:2].mean()), float(along[2:].mean())))
+    return plane.corners(plane.ends_of(before))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.receiver.screen.grid import Grid, columns_at
+from rxcli.receiver.screen.grid import Grid, columns_at, straightened
 from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import Float32Array, FloatArray
@@ -53,11 +53,6 @@ class Plane:
         return cls(grid, n_columns, float(v0 + shift), float(c + shift * g), float(d + shift * h))
 
     def along(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """(...) v of positions of `Strips`."""
-        scale = 1 + self.grid.numbers[5] * (x * x + y * y)
-        return self.along_flat(x * scale, y * scale)
-
-    def along_flat(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """(...) v of offsets from the picture's middle, with lens distortion removed."""
         _, _, _, g, h, _ = self.grid.numbers
         return np.asarray((self.v0 + self.c * x + self.d * y) / (1 + g * x + h * y))
@@ -77,6 +72,11 @@ class Plane:
         left, right = float(first_column), float(first_column + self.n_columns)
         return self.pixels(np.array([[left, ends[0]], [right, ends[0]], [right, ends[1]], [left, ends[1]]]))
 
+    def ends_of(self, corners: FloatArray) -> tuple[float, float]:
+        """v at the top and the bottom of a screen with (4, 2) corners, pixels."""
+        v = self.along(*self.grid.flat(corners))
+        return float(v[:2].mean()), float(v[2:].mean())
+
 
 def _middle_of(grid: Grid, n_columns: int, row: float) -> FloatArray:
     """(2,) pixel of the screen's middle column on a picture row."""
@@ -90,8 +90,8 @@ def _middle_of(grid: Grid, n_columns: int, row: float) -> FloatArray:
 
 def find_rows(
     strips: Strips, light: Float32Array, grid: Grid, n_columns: int, aspect: float
-) -> tuple[Plane, list[tuple[float, float]]]:
-    """The screen's plane, and candidate pairs of v at which the screen begins and ends, likeliest first.
+) -> tuple[Plane, tuple[float, float], bool]:
+    """The screen's plane, the v at which the screen begins and ends, and whether it is dark at its top or bottom.
 
     Args:
         strips: of the picture.
@@ -106,10 +106,10 @@ def find_rows(
     plane = Plane.through(grid, n_columns, aspect, row)
     top, bottom = lit_range(*_light_along(strips, light, plane))
     missing = 1 - (bottom - top)
-    if missing < _WHOLE:
-        # A slightly too large outline costs less than omitted rows.
-        return plane, [(bottom - 1, top + 1)]
-    return plane, [(top - missing / 2, bottom + missing / 2), (top, bottom), (top, top + 1), (bottom - 1, bottom)]
+    if missing > _WHOLE:
+        return plane, (top - missing / 2, bottom + missing / 2), True
+    # A slightly too large outline costs less than omitted rows.
+    return plane, (bottom - 1, top + 1), False
 
 
 def lit_range(v: FloatArray, light: FloatArray, longest: float = 1.0) -> tuple[float, float]:
@@ -141,7 +141,8 @@ def _light_along(strips: Strips, light: Float32Array, plane: Plane) -> tuple[Flo
     u, x, y = (values[:, :whole].reshape(n_blocks, -1, n).mean(axis=2) for values in (u, strips.x, strips.y))
     inside = (u > 0) & (u < plane.n_columns)
     # A strip's rows of one window lie evenly along the screen.
-    ends = [plane.along(x[inside], y[inside] + side * strips.half_height) for side in (-1, 1)]
+    radial = plane.grid.numbers[5]
+    ends = [plane.along(*straightened(radial, x[inside], y[inside] + side * strips.half_height)) for side in (-1, 1)]
     v = ends[0][:, None] + (ends[1] - ends[0])[:, None] * (np.arange(n_rows) + 0.5) / n_rows
     extent = 1 + 2 * _BEYOND
     # One bin more at either end takes what lies beyond.

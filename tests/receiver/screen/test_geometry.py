@@ -189,14 +189,16 @@ PERSPECTIVE = np.array([[310.0, 420], [3700, 250], [3805, 2790], [205, 2500]])
 @pytest.mark.parametrize("corners", [ROLLED, PERSPECTIVE], ids=["rolled", "perspective"])
 def test_outlines_against_projection(corners: FloatArray, of: Lens | None, order: tuple[int, ...]) -> None:
     corners = corners[list(order)]
-    found = geometry.column_outlines(corners, 5, 2, WIDTH, HEIGHT, of)
-    for edge, u in enumerate(np.linspace(0, 1, 11)):
+    found = geometry.column_outlines(corners, 20, 2, WIDTH, HEIGHT, of)
+    strip_px = np.abs(np.diff(found.edges_x, axis=0)).mean()
+    for edge, u in enumerate(np.linspace(0, 1, 41)):
         expected = edge_x_at_rows(corners, u, found.rows, of)
         known = np.isfinite(expected)
         assert known.sum() > 1500
-        np.testing.assert_allclose(found.edges_x[edge, known], expected[known], atol=0.03)
-    for strip in range(10):
-        middle = edge_x_at_rows(corners, (strip + 0.5) / 10, found.rows, of)
+        tolerance = 0.02 * strip_px if edge % 2 else 0.03  # Borders of columns are exact.
+        np.testing.assert_allclose(found.edges_x[edge, known], expected[known], atol=tolerance)
+    for strip in range(40):
+        middle = edge_x_at_rows(corners, (strip + 0.5) / 40, found.rows, of)
         shown = np.isfinite(middle)
         assert (found.inside[strip // 2, strip % 2] != shown).sum() <= 4
     assert found.sensor_row is None
@@ -217,18 +219,6 @@ def test_row_map_of_a_picture_corrected_in_the_camera(order: tuple[int, ...]) ->
     np.testing.assert_allclose(found.sensor_row[found.inside], expected[found.inside], atol=0.02)
     straight = geometry.column_outlines(PERSPECTIVE[list(order)], 5, 2, WIDTH, HEIGHT, None)
     np.testing.assert_array_equal(found.edges_x, straight.edges_x)
-
-
-@pytest.mark.parametrize("of", [None, lens()])
-def test_quick_outlines_are_off_by_hundredths_of_a_strip(of: Lens | None) -> None:
-    exact = geometry.column_outlines(PERSPECTIVE, 20, 4, WIDTH, HEIGHT, of)
-    quick, middles = geometry.quick_outlines(PERSPECTIVE, 20, 4, WIDTH, HEIGHT, of)
-    inside = exact.inside.reshape(80, -1)
-    off = (np.abs(quick.edges_x - exact.edges_x)[1:] / np.diff(exact.edges_x, axis=0))[inside]
-    assert off.mean() < 0.01
-    assert off.max() < 0.05
-    assert (quick.inside != exact.inside).mean() < 0.001
-    np.testing.assert_allclose(middles, geometry.column_middles(PERSPECTIVE, 20, of), atol=0.5)
 
 
 @settings(max_examples=40)
@@ -254,18 +244,6 @@ def test_a_screen_beside_the_picture_has_nothing_inside(top: float) -> None:
     found = geometry.column_outlines(corners, 4, 1, WIDTH, HEIGHT)
     assert found.rows.size == 1
     assert not found.inside.any()
-
-
-@pytest.mark.parametrize("of", [None, "corrected"])
-def test_outlines_of_some_columns(of: str | None) -> None:
-    corrected = None if of is None else lens(corrected=True)
-    whole = geometry.column_outlines(PERSPECTIVE, 5, 2, WIDTH, HEIGHT, corrected)
-    part = geometry.column_outlines(PERSPECTIVE, 5, 2, WIDTH, HEIGHT, corrected, slice(1, 4))
-    np.testing.assert_array_equal(part.edges_x, whole.edges_x[2:9])
-    np.testing.assert_array_equal(part.inside, whole.inside[1:4])
-    assert (part.sensor_row is None) == (whole.sensor_row is None)
-    if part.sensor_row is not None and whole.sensor_row is not None:
-        np.testing.assert_array_equal(part.sensor_row, whole.sensor_row[1:4])
 
 
 def test_a_screen_of_one_row() -> None:

@@ -1,23 +1,12 @@
-"""Strips of tracked frames: cells added up by words are the sums of their pixels, and strips show what is there."""
+"""Strips of tracked frames show the light that is there."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from rxcli.receiver.sampling.tracked import _sums, map_strips, sample_strips
+from rxcli.receiver.plane.tracked import map_strips, sample_strips
 from rxcli.types import Frame, Outlines
-
-
-@pytest.mark.parametrize("cell_px", [4, 8, 12, 16, 20, 24, 40, 256])
-def test_sums_of_words_are_those_of_pixels(cell_px: int) -> None:
-    """White pixels too, which fill every number to the brim; rows in a wider picture, as decoders give them."""
-    rng = np.random.default_rng(cell_px)
-    pixels = rng.integers(0, 256, (300, 1024), dtype=np.uint8)
-    pixels[:9] = 255
-    n = 1000 // cell_px
-    part = pixels[:, : n * cell_px]
-    assert (_sums(part, cell_px) == part.reshape(300, n, cell_px).sum(axis=2)).all()
 
 
 def outlines(n_columns: int, n_strips: int, strip_px: float, n_rows: int, left: float = 8.0) -> Outlines:
@@ -44,5 +33,4 @@ def test_strips_show_the_light_at_their_middle(dtype: type[np.uint8] | type[np.u
     light = sample_strips(frame, strips)
     assert light.shape == (3, 2, n_rows)
     expected = (middles / width).reshape(3, 2, 1)
-    # Cells at the picture's edge are half beyond it.
     np.testing.assert_allclose(light[:, 1:], np.broadcast_to(expected[:, 1:], light[:, 1:].shape), atol=0.012)
