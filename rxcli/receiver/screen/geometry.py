@@ -24,7 +24,7 @@ _VIEWER_CORNERS = {1: (0, 1, 2, 3), 2: (1, 0, 3, 2), 3: (2, 3, 0, 1), 4: (3, 2, 
 _OVERHANG = 0.02
 #: Sides of a picture, in the order of its corners: side i goes from corner i to corner i + 1.
 SIDE_NAMES = ("top", "right", "bottom", "left")
-#: Points down the screen through which borders of columns are drawn.
+#: Points down the screen through which edges of strips are drawn.
 _N_POINTS = 65
 #: Maximum displacement of a point by a lens, in focal lengths.
 _LARGEST_MOVE = 10.0
@@ -133,8 +133,6 @@ def column_outlines(
 ) -> Outlines:
     """Outlines of `n_columns` columns of `n_strips` strips on a picture of `width` x `height`.
 
-    Strips lie evenly between the columns' borders, which errs by hundredths of a strip.
-
     Args:
         corners: (4, 2) pixels of the stored picture, the viewer's top-left first.
         n_columns: columns of the screen.
@@ -143,14 +141,14 @@ def column_outlines(
         height: rows.
         lens: lens model of the picture.
     """
-    points, v = _down_the_screen(np.linspace(0, 1, n_columns + 1), corners, lens)
+    points, v = _down_the_screen(np.linspace(0, 1, n_columns * n_strips + 1), corners, lens)
     top = int(np.clip(np.floor(corners[:, 1].min()), 0, height - 1))
     rows = np.arange(top, int(np.clip(np.ceil(corners[:, 1].max()), top, height - 1)) + 1)
     knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
     step = 1 if points[0, -1, 1] > points[0, 0, 1] else -1  # On a screen upside down y falls with v.
     y, x = points[:, ::step, 1], points[:, ::step, 0]
-    borders = _interpolated(np.broadcast_to(knots, (len(y), knots.size)), y, x, np.broadcast_to(v[::step], y.shape))
-    knot_x, knot_v = (_divided(values, n_strips) for values in borders)
+    at_knots = np.broadcast_to(knots, (len(y), knots.size))
+    knot_x, knot_v = _interpolated(at_knots, y, x, np.broadcast_to(v[::step], y.shape))
     edges_x = _between_knots(knot_x.astype(np.float32), knots, rows)
     middle_v = _between_knots(((knot_v[1:] + knot_v[:-1]) / 2).astype(np.float32), knots, rows)
     inside = (middle_v > 0) & (middle_v < 1)
@@ -173,12 +171,6 @@ def _down_the_screen(u: FloatArray, corners: FloatArray, lens: Lens | None) -> t
     """Pixels (n, m, 2) of points down the screen at each u (n,), from a little above it to below it, and their v."""
     v = np.linspace(-_OVERHANG, 1 + _OVERHANG, _N_POINTS)
     return screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens), v
-
-
-def _divided(values: FloatArray, parts: int) -> FloatArray:
-    """Divide the distance between adjacent lines of values (n, K) into equal parts: (parts * (n - 1) + 1, K)."""
-    between = values[:-1, None] + np.diff(values, axis=0)[:, None] * (np.arange(parts)[:, None] / parts)
-    return np.concatenate([between.reshape(-1, values.shape[1]), values[-1:]])
 
 
 def _interpolated(places: FloatArray | IntArray, known: FloatArray, *values: FloatArray) -> list[FloatArray]:
