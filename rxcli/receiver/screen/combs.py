@@ -58,15 +58,20 @@ def likeness(sigma: float, distance: float) -> tuple[float, float]:
 
 
 def find_combs(strips: Strips, sigma: float, part: int = 0) -> list[Comb]:
-    """The strongest combs in one part of the picture, strongest first.
+    """The strongest combs in one part of the picture, strongest first; none if the strongest may be chance.
 
     Args:
         strips: of the picture.
         sigma: light spread of the screen, column pitches.
         part: number of the part, from the left.
     """
-    own = strips.part(part)
-    return _distinct(sorted(_combs_of_part(own, sigma, part), key=lambda comb: -comb.score), SETTINGS.n_combs)
+    chosen: list[Comb] = []
+    for comb in sorted(_combs_of_part(strips.part(part), sigma, part), key=lambda comb: -comb.score):
+        if not any(comb.is_like(earlier) for earlier in chosen):
+            chosen.append(comb)
+        if len(chosen) == SETTINGS.n_combs or chosen[0].score <= SETTINGS.min_comb:
+            break
+    return [comb for comb in chosen if chosen[0].score > SETTINGS.min_comb]
 
 
 def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
@@ -79,16 +84,6 @@ def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
     numbers = np.array([comb.phase - pitch * raw_x.mean(), pitch, pitch * comb.turn, 0.0, 0.0, 0.0])
     grid = Grid(numbers, strips.width, strips.height, strips.lens)
     return grid_through(grid, x, y, comb.phase + comb.pitch * bent)
-
-
-def _distinct(combs: list[Comb], max_combs: int) -> list[Comb]:
-    chosen: list[Comb] = []
-    for comb in combs:
-        if len(chosen) == max_combs:
-            break
-        if not any(comb.is_like(earlier) for earlier in chosen):
-            chosen.append(comb)
-    return chosen
 
 
 def _combs_of_part(strips: Strips, sigma: float, part: int) -> list[Comb]:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.combs import Comb, find_combs, grid_of_comb
-from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_through
+from rxcli.receiver.screen.combs import find_combs, grid_of_comb
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.settings import SETTINGS
@@ -171,13 +171,12 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
         sigma: light spread of the screen, column pitches.
         rival: a grid that competes with those of the combs, unless the strongest comb's is plain.
     """
-    some, combs = strips.blocks(slice(None, None, 2)), _possible_combs(strips, sigma)
+    some, combs = strips.blocks(slice(None, None, 2)), find_combs(strips, sigma)
     if combs and (strongest := with_light(some, grid_of_comb(combs[0], strips), sigma)).is_plain:
         strongest = moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
         return moved_by_waveforms(strips, strongest, sigma, SETTINGS.last_steps)
     best = max((with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs), key=_score, default=None)
     starts = [] if best is None else [moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)]
-    starts += [slipped_grid(strips.blocks(slice(None, None, 4)), starts[0], sigma)] if starts else []
     starts += [rival] if rival is not None and with_light(some, rival, sigma).contrast > 0 else []
     moved = [moved_by_waveforms(strips, grid, sigma, SETTINGS.last_steps) for grid in starts]
     settled = [with_light(strips, grid, sigma) for grid in moved]
@@ -195,21 +194,6 @@ def _score(grid: Grid) -> float:
     return grid.explained + SETTINGS.contrast_weight * grid.contrast
 
 
-def slipped_grid(strips: Strips, grid: Grid, sigma: float) -> Grid:
-    """The best grid that differs from the given one by a column at the left or at the right.
-
-    Where light is faint at an end, the columns there may be counted wrong.
-    """
-    x, y = strips.x.ravel(), strips.y.ravel()
-    u = columns_at(grid.numbers, x, y)
-    grids = []
-    for end_weight in (np.square(strips.raw_x.ravel() + 0.5), np.square(strips.raw_x.ravel() - 0.5)):
-        for shift in (-end_weight, end_weight):
-            moved = moved_by_waveforms(strips, grid_through(grid, x, y, u + shift), sigma, SETTINGS.last_steps)
-            grids.append(with_light(strips, moved, sigma))
-    return max(grids, key=_score)
-
-
 def narrow_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid | None:
     """The grid of narrow columns, or None.
 
@@ -218,14 +202,14 @@ def narrow_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid
     """
     some, few = (strips.blocks(slice(None, None, step)) for step in (2, 4))
     for part in sorted(range(strips.n_parts), key=lambda part: abs(part - strips.n_parts // 2)):
-        for comb in _possible_combs(strips, sigma, part)[:1]:
+        for comb in find_combs(strips, sigma, part)[:1]:
             own = few.part(part)
-            grid = moved_by_waveforms(own, grid_of_comb(comb, strips), sigma, SETTINGS.narrow_steps)
+            grid = moved_by_waveforms(own, grid_of_comb(comb, strips), sigma, SETTINGS.first_steps)
             is_block = abs(grid.pitch_px - _BLOCK_PX) < _BLOCK_TOLERANCE_PX
-            if is_block or not _stands_out(own, with_light(own, grid, sigma), SETTINGS.min_plain_contrast):
+            if is_block or not _stands_out(own, with_light(own, grid, sigma), SETTINGS.min_narrow_contrast):
                 continue
             grid = with_light(some, _followed(some, grid, float(own.raw_x.mean()), sigma), sigma)
-            if _stands_out(some, grid, SETTINGS.min_plain_contrast):
+            if _stands_out(some, grid, SETTINGS.min_narrow_contrast):
                 return grid
     if rival is None or with_light(few, rival, sigma).contrast <= 0:
         return None
@@ -244,12 +228,6 @@ def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
     return grid
 
 
-def _possible_combs(strips: Strips, sigma: float, part: int = 0) -> list[Comb]:
-    """The combs to fit grids to; none if the best may be chance."""
-    combs = find_combs(strips, sigma, part)
-    return combs if combs and combs[0].score > SETTINGS.min_comb else []
-
-
 def _stands_out(strips: Strips, grid: Grid, min_contrast: float = SETTINGS.min_contrast) -> bool:
     """Whether borders half a column further on explain less, by more than chance."""
     by_chance = grid.explained / np.sqrt(strips.picture_rows)
@@ -262,14 +240,13 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> li
     starts = [first_columns(profile, layout.n_columns) for layout in layouts]
     odds = np.concatenate([start.log_odds for start in starts])
     likeliest = float(odds.max())
-    is_plain = (odds > likeliest + SETTINGS.plain_log_odds).sum() == 1
     found: list[OutlineCandidate] = []
     for layout, start in zip(layouts, starts, strict=True):
         likely = np.flatnonzero(start.log_odds > start.log_odds.max() + SETTINGS.min_log_odds)
         best = int(start.columns[start.log_odds.argmax()])
-        # Where the first column is plain, light beyond the screen's ends does not come from it.
-        n_columns = layout.n_columns if is_plain else None
-        own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, SETTINGS.last_steps, n_columns=n_columns)
+        own = moved_by_waveforms(
+            strips, grid.shifted(best), layout.sigma, SETTINGS.last_steps, n_columns=layout.n_columns
+        )
         plane, ends, has_bars = find_rows(strips, light, own, layout.n_columns, layout.aspect)
         for number, log_odds in zip(start.columns[likely].tolist(), start.log_odds[likely].tolist(), strict=True):
             corners = plane.corners(ends, number - best)

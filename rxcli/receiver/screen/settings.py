@@ -26,8 +26,6 @@ class FinderSettings:
     #: Share of the strips, the least coherent, that row noise is estimated from; share with the clearest stripes.
     dark_share: float = 0.3
     bright_share: float = 0.2
-    #: Maximum lag, in averaged rows, at which the light of a strip is correlated, as within a slot.
-    max_lag: int = 40
     #: Columns are narrow if the coherence at the far distance, picture widths, is below this share of that at the near.
     near_widths: float = 0.004
     far_widths: float = 0.01
@@ -72,16 +70,14 @@ class FinderSettings:
     radial_sd: float = 0.004
     #: Weight of the log-likelihood that borders add, relative to that of the light that waveforms explain.
     contrast_weight: float = 1.5
-    #: Steps on every second window, of narrow columns in one part of a picture, and last steps on all windows.
+    #: Steps on some of the windows, and last steps on all windows.
     first_steps: int = 3
-    narrow_steps: int = 4
     last_steps: int = 2
     #: Factor by which the followed width of a grid of narrow columns grows at a time.
     reach_gain: float = 1.4
-    #: Minimum contrast, as a share of the explained light times the root of the number of rows; that of narrow columns
-    #: and of a picture that may be rotated.
+    #: Minimum contrast, as a share of the explained light times the root of the number of rows; that of narrow columns.
     min_contrast: float = 0.95
-    min_plain_contrast: float = 1.5
+    min_narrow_contrast: float = 1.5
     #: Focal length of a camera that no profile describes, picture widths.
     focal_widths: float = 0.8
     #: Gauss-Newton steps with decided slots, and prior standard deviations of the finder's columns: shift and widths in
@@ -93,8 +89,6 @@ class FinderSettings:
     nearly_all: float = 0.98
     #: Log-odds relative to the likeliest first column down to which another one is possible.
     min_log_odds: float = -7.0
-    #: Log-odds of the second likeliest below which the first column is certain and the screen's ends help the grid.
-    plain_log_odds: float = -3.0
 
 
 SETTINGS = FinderSettings()

@@ -247,7 +247,7 @@ def _independent_rows(quiet: Float32Array, lit: Float32Array) -> float:
     bright = np.argsort(-lit.mean(axis=0))[: max(int(SETTINGS.bright_share * lit.shape[1]), 1)]
     some = quiet[::4, bright]
     rows = some.shape[2]
-    lags = range(min(SETTINGS.max_lag, (rows + 1) // 2))
+    lags = range((rows + 1) // 2)
     products = np.array([float(np.einsum("wsr,wsr->", some[..., lag:], some[..., : rows - lag])) for lag in lags])
     correlation = products * rows / (rows - np.arange(len(lags))) / (products[0] + TINY)
     return float(rows / (1 + 2 * float(np.square(correlation[1:]).sum())))

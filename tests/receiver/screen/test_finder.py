@@ -20,11 +20,10 @@ from rxcli.receiver.screen.find import (
     find_screens,
     follow_outline,
     shows_columns,
-    slipped_grid,
     why_useless,
     wide_grid,
 )
-from rxcli.receiver.screen.grid import columns_at, grid_between, grid_through
+from rxcli.receiver.screen.grid import columns_at, grid_between
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.screen.rows import lit_range
@@ -253,15 +252,6 @@ def test_the_true_grid_explains_more_than_others_and_is_reached_from_near() -> N
     near = replace(true, numbers=true.numbers * np.array([1, 1.015, 1, 1, 1, 1]) + np.array([0.1, 0, 0.2, 0, 0, 0]))
     off = moved_by_waveforms(strips, near, 0.45, 8).numbers[:3] - true.numbers[:3]
     assert np.abs(off).max() < 0.3
-
-
-def test_a_grid_that_counts_a_column_too_many_at_one_end_is_mended() -> None:
-    strips, true = read_strips(drawn("dark sides")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
-    x, y = strips.x.ravel(), strips.y.ravel()
-    wrong = grid_through(true, x, y, columns_at(true.numbers, x, y) + (strips.raw_x.ravel() - 0.5) ** 2)
-    mended = slipped_grid(strips, wrong, 0.45)
-    off = [np.abs(columns_at(grid.numbers, x, y) - columns_at(true.numbers, x, y)).max() for grid in (mended, wrong)]
-    assert off[0] < 0.5 < off[1]
 
 
 def test_a_rival_replaces_missing_combs_where_borders_show(monkeypatch: pytest.MonkeyPatch) -> None:
