@@ -38,35 +38,31 @@ class Comb:
     across: float
     along: float
     phase: float
-    #: Number of the part, from the left.
-    part: int
 
     def is_like(self, comb: Comb) -> bool:
         """Whether two combs are so similar that a fit from either gives the same grid."""
         shape = abs(self.turn - comb.turn) + (abs(self.across - comb.across) + abs(self.along - comb.along)) / 4
-        same = self.part == comb.part and abs(self.pitch - comb.pitch) < _SAME_PITCH
-        return same and shape * self.pitch < _SAME_SHAPE
+        return abs(self.pitch - comb.pitch) < _SAME_PITCH and shape * self.pitch < _SAME_SHAPE
 
 
 @lru_cache(maxsize=64)
-def likeness(sigma: float, distance: float) -> tuple[float, float]:
-    """Mean and first harmonic, over the phase, of the correlation of two positions `distance` columns apart."""
+def likeness(sigma: float, distance: float) -> float:
+    """Mean over the phase of the correlation of two positions `distance` columns apart."""
     middle, centres = np.arange(64) / 64, np.arange(-6, 8) + 0.5
     left, right = (np.exp(-((middle[:, None] + s * distance / 2 - centres) ** 2) / (2 * sigma**2)) for s in (-1, 1))
     cosine = (left * right).sum(-1) / np.sqrt((left**2).sum(-1) * (right**2).sum(-1))
-    return float(cosine.mean()), float(2 * (cosine * np.cos(2 * np.pi * middle)).mean())
+    return float(cosine.mean())
 
 
-def find_combs(strips: Strips, sigma: float, part: int = 0) -> list[Comb]:
-    """The strongest combs in one part of the picture, strongest first; none if the strongest may be chance.
+def find_combs(strips: Strips, sigma: float) -> list[Comb]:
+    """The strongest combs, strongest first; none if the strongest may be chance.
 
     Args:
-        strips: of the picture.
+        strips: of the picture or of a part of it.
         sigma: light spread of the screen, column pitches.
-        part: number of the part, from the left.
     """
     chosen: list[Comb] = []
-    for comb in sorted(_combs_of_part(strips.part(part), sigma, part), key=lambda comb: -comb.score):
+    for comb in sorted(_all_combs(strips, sigma), key=lambda comb: -comb.score):
         if not any(comb.is_like(earlier) for earlier in chosen):
             chosen.append(comb)
         if len(chosen) == SETTINGS.n_combs or chosen[0].score <= SETTINGS.min_comb:
@@ -75,9 +71,8 @@ def find_combs(strips: Strips, sigma: float, part: int = 0) -> list[Comb]:
 
 
 def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
-    """The grid of the whole picture that is nearest to a comb in its part."""
-    own = strips.part(comb.part)
-    raw_x, raw_y, x, y = (values.ravel() for values in (own.raw_x, own.raw_y, own.x, own.y))
+    """The grid of the whole picture that is nearest to a comb of some strips."""
+    raw_x, raw_y, x, y = (values.ravel() for values in (strips.raw_x, strips.raw_y, strips.x, strips.y))
     local_x, local_y = (raw_x - raw_x.mean()) * strips.n_parts, raw_y * strips.n_parts
     bent = local_x + comb.turn * local_y + comb.across * local_x**2 + comb.along * local_x * local_y
     pitch = comb.pitch * strips.n_parts
@@ -86,7 +81,7 @@ def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
     return grid_through(grid, x, y, comb.phase + comb.pitch * bent)
 
 
-def _combs_of_part(strips: Strips, sigma: float, part: int) -> list[Comb]:
+def _all_combs(strips: Strips, sigma: float) -> list[Comb]:
     """The best comb of each pitch."""
     step = strips.step * strips.n_parts
     max_pitch = min(SETTINGS.max_pitch, 1 / (SETTINGS.min_column_strips * step))
@@ -97,12 +92,13 @@ def _combs_of_part(strips: Strips, sigma: float, part: int) -> list[Comb]:
     for distance in np.unique(distances).tolist():
         lit_pairs = strips.lit[:, :-distance] * strips.lit[:, distance:]
         tried = pitches[distances == distance]
-        mean, harmonic = likeness(sigma, round(float(tried.mean()) * distance * step, 2))
+        mean = likeness(sigma, round(float(tried.mean()) * distance * step, 2))
         rest = np.sqrt(lit_pairs) * strips.coherence(distance) - np.float32(mean) * lit_pairs
         chance = np.sqrt(float(lit_pairs.sum()) / (2 * strips.n_rows)) + TINY
-        # Combs are scaled to their standard deviation by chance, so that different distances can be compared.
-        rest *= np.float32(np.sign(harmonic) / chance)
-        found += _best_combs(rest, step, y, tried, part, strips.n_parts)
+        # Pairs across a border are less coherent than others. Combs are scaled to their standard deviation by chance, so
+        # that different distances can be compared.
+        rest /= np.float32(-chance)
+        found += _best_combs(rest, step, y, tried, strips.n_parts)
     return found
 
 
@@ -112,9 +108,7 @@ def _range(largest: float, at_corner: float) -> FloatArray:
     return np.linspace(-largest, largest, 2 * n + 1)
 
 
-def _best_combs(
-    rest: Float32Array, step: float, y: FloatArray, pitches: FloatArray, part: int, n_parts: int
-) -> list[Comb]:
+def _best_combs(rest: Float32Array, step: float, y: FloatArray, pitches: FloatArray, n_parts: int) -> list[Comb]:
     """The best comb of each pitch, from values (W, n) of pairs of strips: sum along the strips, then over windows."""
     largest, half_x, half_y = float(pitches[-1]), 0.5, float(np.abs(y).max())
     if SETTINGS.max_turn * largest * (y[1] - y[0]) < SETTINGS.corner_step and len(y) % 2 == 0:
@@ -137,7 +131,7 @@ def _best_combs(
         i, j, k = np.unravel_index(int(power[number].argmax()), power[number].shape)
         phase = -float(np.angle(sums[number, i, j, k])) / (2 * np.pi)
         shape = float(turns[k]), float(across[i]), float(along[j])
-        out.append(Comb(float(np.sqrt(power[number, i, j, k])), pitch, *shape, phase, part))
+        out.append(Comb(float(np.sqrt(power[number, i, j, k])), pitch, *shape, phase))
     return out
 
 
@@ -151,7 +145,4 @@ def _waves(n: int, step: float, start: int, n_frequencies: int) -> NDArray[np.co
 def _turned(turns: FloatArray) -> NDArray[np.complex64]:
     """exp(2 pi i `turns`), in single precision after whole turns are taken off."""
     angle = np.asarray((turns - np.rint(turns)) * (2 * np.pi), np.float32)
-    wave = np.empty(angle.shape, np.complex64)
-    np.cos(angle, out=wave.real)
-    np.sin(angle, out=wave.imag)
-    return wave
+    return np.asarray(np.cos(angle) + np.complex64(1j) * np.sin(angle), np.complex64)

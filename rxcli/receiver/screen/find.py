@@ -202,9 +202,9 @@ def narrow_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid
     """
     some, few = (strips.blocks(slice(None, None, step)) for step in (2, 4))
     for part in sorted(range(strips.n_parts), key=lambda part: abs(part - strips.n_parts // 2)):
-        for comb in find_combs(strips, sigma, part)[:1]:
+        for comb in find_combs(strips.part(part), sigma)[:1]:
             own = few.part(part)
-            grid = moved_by_waveforms(own, grid_of_comb(comb, strips), sigma, SETTINGS.first_steps)
+            grid = moved_by_waveforms(own, grid_of_comb(comb, strips.part(part)), sigma, SETTINGS.first_steps)
             is_block = abs(grid.pitch_px - _BLOCK_PX) < _BLOCK_TOLERANCE_PX
             if is_block or not _stands_out(own, with_light(own, grid, sigma), SETTINGS.min_narrow_contrast):
                 continue

@@ -28,8 +28,9 @@ SIDE_NAMES = ("top", "right", "bottom", "left")
 _N_POINTS = 65
 #: Maximum displacement of a point by a lens, in focal lengths.
 _LARGEST_MOVE = 10.0
-#: The inverse of the lens has converged when a step moves every point by less than this many pixels.
-_MIN_STEP = 1e-8
+#: Maximum steps of the inverse of a lens, which reach 1e-6 px for ordinary lenses; it has converged when a step moves
+#: every point by less than this many pixels.
+_INVERSE_STEPS, _MIN_STEP = 20, 1e-8
 #: Rows over which edges are interpolated linearly: straight to a thousandth of a pixel.
 _KNOT_ROWS = 32
 
@@ -55,16 +56,23 @@ def lens_for(model: LensModel, width: int, height: int) -> Lens:
     return Lens(matrix, np.array(model.dist_coeffs, np.float64), model.distortion_already_corrected)
 
 
-def distort(points: FloatArray, lens: Lens) -> FloatArray:
+def bending(lens: Lens | None) -> Lens | None:
+    """The lens if it bends straight lines of the picture; None if there is none or the picture was corrected."""
+    return None if lens is None or lens.corrected else lens
+
+
+def distort(points: FloatArray, lens: Lens | None) -> FloatArray:
     """Undistorted pixels to distorted ones: K distort(K^-1 p), OpenCV's forward polynomial.
 
     Args:
         points: (..., 2) pixels.
-        lens: the lens model.
+        lens: the lens model; None leaves the points alone.
 
     Returns:
         (..., 2) pixels.
     """
+    if lens is None:
+        return points
     k = np.zeros(8)
     k[: min(lens.dist_coeffs.size, 8)] = lens.dist_coeffs[:8]
     k1, k2, p1, p2, k3, k4, k5, k6 = k
@@ -77,19 +85,20 @@ def distort(points: FloatArray, lens: Lens) -> FloatArray:
     return np.stack([fx * xd + cx, fy * yd + cy], axis=-1)
 
 
-def undistort(points: FloatArray, lens: Lens, iterations: int = 20) -> FloatArray:
+def undistort(points: FloatArray, lens: Lens | None) -> FloatArray:
     """Distorted pixels to undistorted ones: the inverse of `distort`, by fixed-point iteration.
 
     Far outside the picture the polynomial has no inverse and the iteration runs away: such points stay where they are.
 
     Args:
         points: (..., 2) pixels.
-        lens: the lens model.
-        iterations: steps, at most; 20 reach 1e-6 px for the distortion of ordinary lenses.
+        lens: the lens model; None leaves the points alone.
     """
+    if lens is None:
+        return points
     reach = _LARGEST_MOVE * np.abs(lens.camera_matrix[0, 0])
     found = points.copy()
-    for _ in range(iterations):
+    for _ in range(_INVERSE_STEPS):
         step = found + points - distort(found, lens)
         before, found = found, np.where((np.abs(step - points) <= reach).all(axis=-1, keepdims=True), step, points)
         if np.abs(found - before).max(initial=0.0) < _MIN_STEP:
@@ -121,11 +130,9 @@ def screen_to_picture(points: FloatArray, corners: FloatArray, lens: Lens | None
         corners: (4, 2) pixels of the stored picture, the viewer's top-left first.
         lens: lens model of the picture; None or corrected: the screen's sides are straight.
     """
-    bent = lens is not None and not lens.corrected
-    plane = undistort(corners, lens) if bent and lens is not None else corners
+    plane = undistort(corners, bending(lens))
     projected = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ homography(plane).T
-    pixels = projected[..., :2] / projected[..., 2:]
-    return distort(pixels, lens) if bent and lens is not None else pixels
+    return distort(projected[..., :2] / projected[..., 2:], bending(lens))
 
 
 def column_outlines(

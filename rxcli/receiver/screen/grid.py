@@ -71,7 +71,7 @@ class Grid:
         for _ in range(_INVERSE_STEPS):
             distorted = flat / (1 + self.numbers[5] * (distorted**2).sum(axis=-1, keepdims=True))
         pixels = distorted * self.width + np.array([(self.width - 1) / 2, (self.height - 1) / 2])
-        return pixels if self.lens is None or self.lens.corrected else geometry.distort(pixels, self.lens)
+        return geometry.distort(pixels, geometry.bending(self.lens))
 
     def shifted(self, columns: float) -> Grid:
         """The grid with its columns renumbered from column `columns` on."""
@@ -88,8 +88,7 @@ def grid_between(corners: FloatArray, n_columns: int, size: tuple[int, int], len
         lens: of the picture, if known.
     """
     width, height = size
-    bent = lens is not None and not lens.corrected
-    to_screen = np.linalg.inv(geometry.homography(geometry.undistort(corners, lens) if bent and lens else corners))
+    to_screen = np.linalg.inv(geometry.homography(geometry.undistort(corners, geometry.bending(lens))))
     matrix = to_screen @ np.array([[width, 0, (width - 1) / 2], [0, width, (height - 1) / 2], [0, 0, 1]])
     across, below = n_columns * matrix[0] / matrix[2, 2], matrix[2] / matrix[2, 2]
     u0, g, h = across[2], below[0], below[1]

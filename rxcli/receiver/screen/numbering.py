@@ -22,8 +22,8 @@ _PARTS, _LEVEL_PARTS = 8, 16
 _OFF_SCALE, _LIT_SCALE, _DARK_PART, _PART_COUNTS = 1.2, 6.0, 0.25, 0.5
 #: Minimum mean log-odds of parts of a column that belong to the light.
 _ENDS = 0.05
-#: Log-odds of each column outside the picture.
-_OUTSIDE = -4.0
+#: Log-odds of each column outside the picture, and their minimum at ends of the picture that light reaches.
+_OUTSIDE, _LARGER = -4.0, -3.0
 #: Standard deviation of the light's middle about the screen's middle, screen widths.
 _LIGHT_SD = 0.175
 #: Columns of the picture that must lie beyond light which ends in the picture.
@@ -135,7 +135,8 @@ def first_columns(light: LightProfile, n_columns: int) -> FirstColumns:
     reaches = np.array([begin < left + _IN_VIEW, end_of_light > right - _IN_VIEW])
     off = (begin + end_of_light) / 2 - middles
     odds = _light_within(light, starts, ends) - 0.5 * np.square(off / (_LIGHT_SD * n_columns))
-    odds += _OUTSIDE * (np.maximum(left - starts, 0.0) + np.maximum(ends - right, 0.0))
+    hidden = np.maximum(np.stack([left - starts, ends - right]), 0.0)
+    odds += _OUTSIDE * (~reaches @ hidden) + np.maximum(_OUTSIDE * (reaches @ hidden), _LARGER)
     odds += _ON_BORDER * (_begins(light, starts, 1) + 1.0 * _begins(light, ends, -1))
     if light.film is not None:
         odds += _FILM * (np.abs(sum(light.film) / 2 - middles) < _IN_MIDDLE)

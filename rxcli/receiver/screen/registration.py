@@ -136,12 +136,12 @@ class ScreenTexture:
     """
 
     def __init__(self, frame: Frame, corners: FloatArray, lens: Lens | None) -> None:
-        self._lens = lens if lens is not None and not lens.corrected else None
+        self._lens = geometry.bending(lens)
         sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
         height, width = (sides[1] + sides[3]) / 2, (sides[0] + sides[2]) / 2
         #: Pixels of a cell across and down.
         self._cell = max(round(width / _CELLS[1]), 1), max(round(height / _CELLS[0]), 1)
-        self._plane = self._before = self._undistorted(corners)
+        self._plane = self._before = geometry.undistort(corners, self._lens).copy()
         self._n_frames = 0
         #: Value and weight of the known texture, and the same on coarse and on fine cells; None if to be recomputed.
         self._mean: Float32Array = np.zeros((*_CELLS, 2), np.float32)
@@ -158,20 +158,20 @@ class ScreenTexture:
         coarse = _Texture(_coarser(fine.values), fine.origin, fine.cell * _COARSE[::-1])
         for texture, known in zip((coarse, fine), self._known, strict=True):
             plane, covariance, correlation = self._fit(texture, known, plane, expected)
-        return Registration(self._distorted(plane), covariance, correlation)
+        return Registration(geometry.distort(plane, self._lens), covariance, correlation)
 
     def with_outline(self, found: Registration, outline: FloatArray, sd: float = _OUTLINE_SD) -> Registration:
         """Combine a registration with an outline (4, 2) of standard deviation `sd`, screen sizes."""
-        measured, at = self._undistorted(outline), self._undistorted(found.corners)
+        measured, at = geometry.undistort(outline, self._lens), geometry.undistort(found.corners, self._lens)
         information = np.linalg.inv(found.covariance)
         known = 1 / (sd * _size(outline)) ** 2
         covariance = np.asarray(np.linalg.inv(information + known * np.eye(8)), np.float64)
         plane = covariance @ (information @ at.ravel() + known * measured.ravel())
-        return Registration(self._distorted(plane.reshape(4, 2)), covariance, found.correlation)
+        return Registration(geometry.distort(plane.reshape(4, 2), self._lens), covariance, found.correlation)
 
     def learn(self, frame: Frame, found: Registration) -> None:
         """Update the texture with a frame in which the screen was found."""
-        self._before, self._plane = self._plane, self._undistorted(found.corners)
+        self._before, self._plane = self._plane, geometry.undistort(found.corners, self._lens)
         self._n_frames += 1
         if self._n_frames > _FIRST_FRAMES and self._n_frames % _LEARN_EVERY:
             return
@@ -186,7 +186,7 @@ class ScreenTexture:
     def _texture_of(self, frame: Frame) -> _Texture:
         """The texture of a frame around the last place of the screen and in its middle; that of one frame is cached."""
         if self._read_last is None or self._read_last[0] is not frame:
-            corners = self._distorted(self._plane)
+            corners = geometry.distort(self._plane, self._lens)
             reach = _REACH * _size(corners)
             size = np.array([frame.width, frame.height])
             start = (corners.min(axis=0) - reach).clip(0, size // 4).astype(int)
@@ -239,15 +239,9 @@ class ScreenTexture:
         """x and y of the screen's cells (V, U), in cells of a frame's texture, with the screen at `plane`."""
         knots, down, across = _positions(*shape)
         projected = knots @ geometry.homography(plane).T
-        pixels = self._distorted(projected[:, :2] / projected[:, 2:])
+        pixels = geometry.distort(projected[:, :2] / projected[:, 2:], self._lens)
         x, y = ((pixels + 0.5 - texture.origin) / texture.cell - 0.5).T.reshape(2, *_KNOTS).astype(np.float32)
         return np.asarray(down @ x @ across, np.float32), np.asarray(down @ y @ across, np.float32)
-
-    def _distorted(self, points: FloatArray) -> FloatArray:
-        return points if self._lens is None else geometry.distort(points, self._lens)
-
-    def _undistorted(self, corners: FloatArray) -> FloatArray:
-        return corners.copy() if self._lens is None else geometry.undistort(corners, self._lens)
 
 
 def _read(texture: _Texture, x: Float32Array, y: Float32Array) -> tuple[Float32Array, Float32Array]:

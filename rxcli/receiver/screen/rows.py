@@ -48,7 +48,10 @@ class Plane:
         across = np.array([(u0 * g + a) * focal, (u0 * h + b) * focal, u0])
         across -= (across @ normal) * normal
         c, d, v0 = np.cross(normal, across) * aspect / n_columns / np.array([focal, focal, 1.0])
-        x, y = (float(value) for value in grid.flat(_middle_of(grid, n_columns, row)))
+        # The middle column's place on that row.
+        y = (row - (grid.height - 1) / 2) / grid.width
+        u = n_columns / 2 - u0
+        x = (u * (1 + h * y) - b * y) / (a - u * g)
         shift = 0.5 - (v0 + c * x + d * y) / (1 + g * x + h * y)
         return cls(grid, n_columns, float(v0 + shift), float(c + shift * g), float(d + shift * h))
 
@@ -76,16 +79,6 @@ class Plane:
         """v at the top and the bottom of a screen with (4, 2) corners, pixels."""
         v = self.along(*self.grid.flat(corners))
         return float(v[:2].mean()), float(v[2:].mean())
-
-
-def _middle_of(grid: Grid, n_columns: int, row: float) -> FloatArray:
-    """(2,) pixel of the screen's middle column on a picture row."""
-    x = grid.width / 2.0
-    for _ in range(8):
-        u = grid.columns_at(np.array([[x, row], [x + 1, row]]))
-        x += (n_columns / 2 - float(u[0])) / max(float(u[1] - u[0]), TINY)
-        x = float(np.clip(x, -2 * grid.width, 3 * grid.width))
-    return np.array([x, row])
 
 
 def find_rows(

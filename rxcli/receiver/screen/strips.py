@@ -161,8 +161,7 @@ def _light_of_strips(plane: LightPlane, n_parts: int) -> tuple[Float32Array, Flo
 
 def flat_places(points: FloatArray, width: int, height: int, lens: Lens | None) -> tuple[FloatArray, FloatArray]:
     """Convert pixels (..., 2) to offsets from the picture's middle in picture widths, with lens distortion removed."""
-    if lens is not None and not lens.corrected:
-        points = geometry.undistort(points, lens)
+    points = geometry.undistort(points, geometry.bending(lens))
     return (points[..., 0] - (width - 1) / 2) / width, (points[..., 1] - (height - 1) / 2) / width
 
 
