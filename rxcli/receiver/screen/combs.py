@@ -95,8 +95,8 @@ def _all_combs(strips: Strips, sigma: float) -> list[Comb]:
         mean = likeness(sigma, round(float(tried.mean()) * distance * step, 2))
         rest = np.sqrt(lit_pairs) * strips.coherence(distance) - np.float32(mean) * lit_pairs
         chance = np.sqrt(float(lit_pairs.sum()) / (2 * strips.n_rows)) + TINY
-        # Pairs across a border are less coherent than others. Combs are scaled to their standard deviation by chance, so
-        # that different distances can be compared.
+        # Pairs across a border are less coherent. Combs are scaled to their standard deviation by chance, so that
+        # different distances can be compared.
         rest /= np.float32(-chance)
         found += _best_combs(rest, step, y, tried, strips.n_parts)
     return found
