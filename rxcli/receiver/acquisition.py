@@ -30,8 +30,6 @@ class Acquisition:
     clock: Clock
     #: The screen, and screens that differ from it only in the number of copies; the copies decide.
     variants: tuple[ScreenProfile, ...] = ()
-    #: (n_copies,) burst of every copy; None if it is still to be estimated.
-    burst: IntArray | None = None
 
     @cached_property
     def binned(self) -> RowProfiles:

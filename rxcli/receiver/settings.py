@@ -26,6 +26,8 @@ class WiringSettings:
     beyond_doubt_log_prob: float = -1e-3
     #: Log-likelihood below the best weight at which a weight is dropped.
     weight_margin: float = 20.0
+    #: Lead of an assignment of copies to bursts, log-likelihood of their similarity, that is beyond doubt.
+    plain_bursts: float = 300.0
     #: Log-likelihood ratio from which a column has packets even without a header; wrong clocks reach 74.
     min_headerless_llr: float = 100.0
 

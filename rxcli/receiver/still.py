@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -96,6 +97,14 @@ def _initial_slots(metrics: FloatArray, isi_memory: int) -> Float32Array:
     if isi_memory == 1:
         return detect.initial_slot_probability(metrics)
     return detect.detect(metrics, detect.plausible_weights(metrics, 0.0)).lit
+
+
+def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[Reception]:
+    """Receptions with the copies assigned to bursts in other ways; none if the similarity of copies leaves no doubt."""
+    (_, similarity), *rivals = sync.possible_bursts(reception.clock, slot_llr(reception.metrics), acquisition.repeats)
+    for clock, rival_similarity in rivals:
+        if similarity - rival_similarity <= SETTINGS.plain_bursts or not reception.is_complete.any():
+            yield replace(reception, clock=clock, posteriors=_detect(reception.metrics, clock))
 
 
 def as_one_column(reception: Reception) -> Reception:
@@ -198,13 +207,16 @@ def _worth_showing(reception: Reception, columns: NDArray[np.int64]) -> NDArray[
 
 
 def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
-    """Receive some columns on the fine grid after removal of row noise."""
-    samples, model = _view(acquisition, reception, np.arange(reception.snr.shape[0]), denoise.SAMPLES_PER_SLOT)
-    scene = denoise.remove_row_noise(reception.scene_of(samples, model))
-    asked = scene.samples.of_columns(columns)
-    likelihoods = channel.slot_likelihoods(asked, reception.clock, model, scene.lit, columns, timing=False)
-    cleaned = replace(reception, cleaned=(scene.samples, model))
-    return _with_metrics(cleaned, columns, likelihoods.metrics, likelihoods.snr)
+    """Receive some columns on the fine grid after removal of row noise, which a second pass finds removed."""
+    if reception.cleaned is None:
+        samples, model = _view(acquisition, reception, np.arange(reception.snr.shape[0]), denoise.SAMPLES_PER_SLOT)
+        scene = denoise.remove_row_noise(reception.scene_of(samples, model))
+        reception = replace(reception, cleaned=(scene.samples, model))
+    assert reception.cleaned is not None
+    samples, model = reception.cleaned
+    lit, asked = reception.clock.on_grid(reception.posteriors.lit), samples.of_columns(columns)
+    likelihoods = channel.slot_likelihoods(asked, reception.clock, model, lit, columns, timing=False)
+    return _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr)
 
 
 @lru_cache(maxsize=1)
@@ -213,9 +225,7 @@ def _denoiser() -> denoise.Denoiser:
 
 
 def _in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> Clock:
-    """Assign copies to bursts as given, or from metrics (C, N + memory, patterns)."""
-    if acquisition.burst is not None:
-        return replace(clock, burst=acquisition.burst)
+    """Assign copies to bursts by their similarity, from metrics (C, N + memory, patterns)."""
     return sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)[0][0]
 
 

@@ -23,11 +23,9 @@ from rxcli.receiver.decode import detect
 from rxcli.receiver.pipeline import ReceiverOptions, receive
 from rxcli.receiver.reception import headerless
 from rxcli.receiver.search import Found, search
-from rxcli.receiver.search.evidence import log_evidence
-from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.still import initial_pass
 from rxcli.results.truth import Score, Scorer, Truth
-from rxcli.types import Frame, FrameResult, Metadata, Mosaic, PacketResult
+from rxcli.types import Clock, Frame, FrameResult, Metadata, Mosaic, PacketResult
 
 FloatArray = NDArray[np.float64]
 
@@ -443,20 +441,22 @@ def found_in(taken: Capture, options: ReceiverOptions) -> Found:
     return found
 
 
-def test_bursts_are_hypotheses_where_packets_leave_doubt() -> None:
+def test_packets_determine_the_bursts_where_the_similarity_of_copies_leaves_doubt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     taken = simulate_frame(replace(small_scene("paper-17k3", "phone-plain"), start_slot=300.0), 1)
-    options = options_for(taken)
-    found = found_in(taken, options)
-    right, best = found.best.reception.clock.burst, found.best
+    best = found_in(taken, options_for(taken)).best
+    right = best.reception.clock.burst
     assert right.max() > 0
-    proposer = Proposer(frame_of(taken), options, Timer(), (found.outline,))
-    assert all(one.bursts is None for one in proposer.siblings(best))
-    burst = np.zeros_like(right)
-    wrong = initial_pass(replace(best.acquisition, burst=burst))
-    own = log_evidence(wrong)
-    misled = replace(best, reception=wrong, evidence=own)
-    assert tuple(right.tolist()) in {one.bursts for one in proposer.siblings(misled)}
-    assert own < best.evidence
+    assert list(still.in_other_bursts(best.acquisition, best.reception)) == []
+    possible_bursts = still.sync.possible_bursts
+
+    def least_similar_first(*given: Any) -> list[tuple[Clock, float]]:
+        return [(clock, 0.0) for clock, _ in reversed(possible_bursts(*given))]
+
+    monkeypatch.setattr(still.sync, "possible_bursts", least_similar_first)
+    assert not np.array_equal(initial_pass(best.acquisition).clock.burst, right)
+    assert np.array_equal(found_in(taken, options_for(taken)).best.reception.clock.burst, right)
 
 
 def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_not() -> None:

@@ -1,4 +1,4 @@
-"""Search for the outline, camera, screen, clock and bursts of a picture.
+"""Search for the outline, camera, screen and clock of a picture.
 
 `propose` yields hypotheses with log priors and never decides. `evidence` measures an initial pass. `search` makes
 initial passes of the best hypotheses, best prior first, until one is certain or the budget is spent. `refusal`

@@ -23,8 +23,6 @@ class Hypothesis:
     variants: tuple[ScreenProfile, ...]
     log_prior: float
     clock: Clock | None = None
-    #: Burst of every copy; None: from the similarity of copies.
-    bursts: tuple[int, ...] | None = None
     profiles: RowProfiles | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -37,7 +35,6 @@ class Hypothesis:
             self.screen.packet_slots,
             self.screen.columns,
             self.screen.slot_rate_hz,
-            self.bursts or (),
             self.screen.name,
         )
 
@@ -76,7 +73,6 @@ class Tried:
         rows_per_slot = 1 / (own.camera.line_delay_s * own.screen.slot_rate_hz)
         parts = [own.screen.name, f"{rows_per_slot:.4g} rows per slot"]
         parts += ["reversed"] if own.camera.reversed else []
-        parts += [f"bursts {' '.join(map(str, own.bursts))}"] if own.bursts else []
         return SearchStep(", ".join(parts), own.log_prior, self.evidence, self.score, self.fate)
 
 

@@ -12,9 +12,6 @@ from rxcli.profiles import ScreenProfile
 from rxcli.receiver.acquisition import noise_of, sample_columns, variants_of
 from rxcli.receiver.cameras import known_camera
 from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
-from rxcli.receiver.corners import too_small
-from rxcli.receiver.light import slot_llr
-from rxcli.receiver.reception import Reception
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
@@ -119,13 +116,11 @@ class Proposer:
             return None
         lead = np.log(clock.header_peak_ratio / SETTINGS.clear_lead)
         log_prior = hypothesis.log_prior + SETTINGS.lead_weight * min(float(lead), 0.0)
-        has_same_copies = hypothesis.bursts is not None and len(hypothesis.bursts) == clock.n_copies
-        bursts = hypothesis.bursts if has_same_copies else None
-        return replace(hypothesis, clock=clock, profiles=profiles, bursts=bursts, log_prior=log_prior)
+        return replace(hypothesis, clock=clock, profiles=profiles, log_prior=log_prior)
 
     def siblings(self, scored: Scored) -> Iterator[Hypothesis]:
         """Hypotheses that differ from a scored one in one respect, with their changed log prior."""
-        hypothesis = replace(scored.hypothesis, camera=scored.context.camera, clock=None, profiles=None, bursts=None)
+        hypothesis = replace(scored.hypothesis, camera=scored.context.camera, clock=None, profiles=None)
         outline, camera, log_prior = hypothesis.outline, hypothesis.camera, hypothesis.log_prior
         clock, n_columns = _clock_of(hypothesis.screen, camera), hypothesis.screen.columns
         for candidate in self.families():
@@ -138,31 +133,6 @@ class Proposer:
         for columns, screen in by_columns.items():
             if columns != n_columns and scored.evidence < SETTINGS.plain:
                 yield self._hypothesis(outline, camera, screen, log_prior)
-        if _is_clear(scored.reception):
-            return
-        for same_clock in by_clock.values() if camera.hypothesis is not None else ():
-            sibling = self._hypothesis(outline, camera, _nearest(same_clock, n_columns), log_prior)
-            if too_small(self.context(sibling), sibling.screen) is None:
-                yield sibling
-        yield from self._of_other_bursts(scored)
-
-    def _of_other_bursts(self, scored: Scored) -> Iterator[Hypothesis]:
-        """Other bursts of the same copies, if packets are uncertain."""
-        reception, repeats = scored.reception, scored.acquisition.repeats
-        complete = reception.is_complete
-        possible = sync.possible_bursts(reception.clock, slot_llr(reception.metrics), repeats)
-        plain = len(possible) == 1 or possible[0][1] - possible[1][1] > SETTINGS.plain_bursts
-        if complete.any() and plain and np.array_equal(possible[0][0].burst, reception.clock.burst):
-            return
-        for clock, _ in possible:
-            if not np.array_equal(clock.burst, reception.clock.burst):
-                yield replace(
-                    scored.hypothesis,
-                    camera=scored.context.camera,
-                    clock=scored.acquisition.clock,
-                    profiles=scored.acquisition.profiles,
-                    bursts=tuple(clock.burst.tolist()),
-                )
 
 
 def likeliest_of_family(outlines: Sequence[Outline]) -> Outline:
@@ -183,12 +153,6 @@ def _left(outline: Outline) -> float:
     """Position of an outline's left side along its top, for a viewer: larger is further right."""
     along = outline.corners[1] - outline.corners[0]
     return float(outline.corners[0] @ along / np.linalg.norm(along))
-
-
-def _is_clear(reception: Reception) -> bool:
-    """Whether nearly all columns have a complete packet of high confidence."""
-    confidence = np.where(reception.is_complete, reception.packet_confidence, 0.0).max(axis=0)
-    return bool((confidence > SETTINGS.clear_confidence).mean() >= SETTINGS.clear_columns)
 
 
 def _nearest(screens: Iterable[ScreenProfile], n_columns: int) -> ScreenProfile:

@@ -13,6 +13,7 @@ from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.camera.settings import SETTINGS as camera_settings
 from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
 from rxcli.receiver.corners import proposed_screens
+from rxcli.receiver.reception import Reception
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
@@ -20,7 +21,7 @@ from rxcli.receiver.search.numbers import less_likely_outlines, numbered
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.refusal import light_without_data, why_no_packets
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.receiver.still import initial_pass
+from rxcli.receiver.still import in_other_bursts, initial_pass
 from rxcli.receiver.unknown_camera import settle
 from rxcli.types import FloatArray, Frame
 
@@ -128,7 +129,7 @@ class _Walk:
         """The same with an estimated camera fitted to its slots until the clock no longer moves."""
         for _ in range(camera_settings.max_fits if best.context.camera.hypothesis else 0):
             camera, moved_slots = settle(best.context, best.acquisition, best.reception)
-            if moved_slots < camera_settings.matters_slots:
+            if moved_slots < camera_settings.matters_slots and best.evidence > SETTINGS.plain_estimate:
                 return best.with_camera(camera)
             hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
             if hypothesis is None:
@@ -170,11 +171,12 @@ class _Walk:
         best = self._best()
         if best is not None:
             # An estimate without packets may be the wrong camera: other cameras come before its siblings.
-            is_doubtful = best.context.camera.hypothesis is not None and best.evidence < SETTINGS.few_packets
+            is_estimated = best.context.camera.hypothesis is not None
+            is_doubtful = is_estimated and best.evidence < SETTINGS.few_packets
             is_near = self._siblings and -self._siblings[0][0] >= best.score - SETTINGS.reach
             if is_near and not (is_doubtful and (self._fresh or self._cameras is not None)):
                 return self._siblings, heapq.heappop(self._siblings)
-            if best.evidence > SETTINGS.plain:
+            if best.evidence > (SETTINGS.plain_estimate if is_estimated else SETTINGS.plain):
                 return None
         while self._cameras is not None and (not self._fresh or self._next_prior > -self._fresh[0][0]):
             try:
@@ -208,8 +210,7 @@ class _Walk:
         if scored.evidence > SETTINGS.bail:
             # Packets may become certain once an estimated camera is fitted: then no other camera is tried.
             scored = self._fitted(scored)
-        bursts = replace(hypothesis, bursts=tuple(scored.reception.clock.burst.tolist()))
-        self._asked.add((bursts.identity, False))
+        scored = _in_likeliest_bursts(scored)
         self._scored.append(scored)
         self._tried.append(Tried(hypothesis, scored.evidence, scored.score, "lost"))
         if scored.evidence > SETTINGS.bail and (best is None or scored.score > best.score - SETTINGS.reach):
@@ -218,14 +219,26 @@ class _Walk:
 
     def _measured(self, hypothesis: Hypothesis, acquisition: Acquisition) -> Scored:
         with self._proposer.timer("detect"):
-            reception = initial_pass(acquisition)
-            own = evidence.log_evidence(reception)
-            score = evidence.score(reception, own, hypothesis.log_prior)
-        return Scored(hypothesis, self._proposer.context(hypothesis), acquisition, reception, own, score)
+            return _rated(hypothesis, self._proposer.context(hypothesis), acquisition, initial_pass(acquisition))
 
 
 def _acquired(hypothesis: Hypothesis) -> Acquisition:
     assert hypothesis.profiles is not None
     assert hypothesis.clock is not None
-    bursts = None if hypothesis.bursts is None else np.array(hypothesis.bursts)
-    return Acquisition(hypothesis.screen, hypothesis.profiles, hypothesis.clock, hypothesis.variants, bursts)
+    return Acquisition(hypothesis.screen, hypothesis.profiles, hypothesis.clock, hypothesis.variants)
+
+
+def _rated(hypothesis: Hypothesis, context: FrameContext, acquisition: Acquisition, reception: Reception) -> Scored:
+    own = evidence.log_evidence(reception)
+    score = evidence.score(reception, own, hypothesis.log_prior)
+    return Scored(hypothesis, context, acquisition, reception, own, score)
+
+
+def _in_likeliest_bursts(scored: Scored) -> Scored:
+    """The same with its copies assigned to bursts as its packets fit best, if they are uncertain."""
+    if scored.evidence < SETTINGS.bail:
+        return scored
+    hypothesis, context, acquisition = scored.hypothesis, scored.context, scored.acquisition
+    receptions = in_other_bursts(acquisition, scored.reception)
+    rivals = (_rated(hypothesis, context, acquisition, reception) for reception in receptions)
+    return max([scored, *rivals], key=lambda rival: rival.score)

@@ -15,12 +15,13 @@ class SearchSettings:
     header_weight: float = 0.1
     #: Evidence that a complete packet adds.
     complete_packet: float = 60.0
-    #: Above this evidence no further cameras are proposed: wrong clocks reach 391.
+    #: Above this evidence nothing further is proposed under a known camera: wrong clocks reach 391.
     plain: float = 400.0
     #: Below this evidence there are no packets: wrong clocks mostly have less than 10, right ones 80.
     bail: float = 20.0
-    #: Below this evidence an estimated camera is rejected: wrong ones do not reach it.
+    #: Below this evidence an estimated camera is rejected; above the second no other one is proposed.
     few_packets: float = 40.0
+    plain_estimate: float = 100.0
     #: Maximum number of initial passes of a frame, and of initial passes without any evidence.
     budget: int = 24
     hopeless_budget: int = 8
@@ -34,11 +35,6 @@ class SearchSettings:
     min_lead: float = 1.6
     #: Log prior lost by each further camera.
     next_camera: float = 0.5
-    #: Bursts are certain if this share of the columns has packets of this confidence, or if the similarity of copies
-    #: leads by this log-likelihood.
-    clear_columns: float = 0.9
-    clear_confidence: float = 0.9
-    plain_bursts: float = 300.0
     #: Probability from which a column's number is likely, and from which it is reported as the screen's; log-odds
     #: within which an outline is possible.
     likely_certainty: float = 0.5
