@@ -56,6 +56,8 @@ class TrackedScreen:
         #: Rows per slot of the frames so far.
         self._rows_per_slot = acquisition.clock.rows_per_slot
         self._n_updates = 0
+        #: Exposure of the last frame relative to that of the picture.
+        self._gain = 1.0
         self._picture = self._new_picture(black_level)
 
     def _new_picture(self, black_level: float | Float32Array) -> known_picture.KnownPicture:
@@ -203,6 +205,10 @@ class TrackedScreen:
         with timer("sampling"):
             light, pose = self.strips(frame), self.pose
             picture = self._picture.placed(pose.placement)
+            gain = picture.gain(light)
+            if abs(gain / self._gain - 1) > SETTINGS.exposure_change:
+                self._gain = gain
+            light /= np.float32(self._gain)
             flat = picture.solve(light)
         with timer("clock"):
             old = replace(last.acquisition.clock, rows_per_slot=self._rows_per_slot)

@@ -50,6 +50,8 @@ class ClipSettings:
     #: corrections.
     late_slots: float = 0.03
     retimings: int = 4
+    #: Change of the exposure from which light is scaled to that of the picture; weights change it by up to 0.15.
+    exposure_change: float = 0.3
     #: Share of a frame's noise, and of its rows per slot, in what is expected of the next.
     frame_share: float = 0.2
     #: Contrast of its headers at which the predicted clock is accepted.

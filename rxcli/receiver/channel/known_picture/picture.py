@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.numerics import box_sums
+from rxcli.numerics import TINY, box_sums
 from rxcli.receiver.channel.known_picture.settings import SETTINGS
 from rxcli.receiver.light import Crosstalk, NoiseModel
 from rxcli.types import BoolArray, Float32Array
@@ -155,6 +155,14 @@ class KnownPicture:
         sums = np.stack([weighted * light, weighted * expected, np.float32(0.5) * inside, inside * light])
         row = observation.frame_row
         return sums if row is None else np.stack([_resampled(values, row, beyond=True) for values in sums])
+
+    def gain(self, light: Float32Array) -> float:
+        """Exposure of a frame relative to earlier ones: the median over the columns of their mean light (C, S, R)."""
+        rows = np.s_[..., :: SETTINGS.gain_every_row]
+        inside, (usual, usual_light) = self._inside[rows], self._sums[2:][rows].sum(axis=(2, 3))
+        before = 0.5 * usual_light / np.maximum(usual, TINY) + self._black_level.mean()
+        mean = (light[rows] * inside).sum(axis=(1, 2)) / np.maximum(inside.sum(axis=(1, 2)), TINY)
+        return float(np.median(mean / np.maximum(before, TINY)))
 
     def solve(self, light: Float32Array) -> ColumnLight:
         """Solve for the columns' own light in a frame.

@@ -57,8 +57,9 @@ class KnownPictureSettings:
     #: Distance of the blur taps, slots.
     side_slots: float = 0.5
 
-    #: Row step for the signal-to-noise ratio of a column.
+    #: Row step for the signal-to-noise ratio of a column, and for the exposure of a frame.
     snr_every_row: int = 5
+    gain_every_row: int = 7
 
 
 SETTINGS = KnownPictureSettings()
