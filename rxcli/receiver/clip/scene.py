@@ -283,8 +283,6 @@ class TrackedScreen:
         n_slots = int(np.ceil(rows.size / old.rows_per_slot)) + 1
         predicted = time.clock_at(frame.index, frame.time_s, old, n_slots, float(rows[0]) - 0.5)
         contrast = self._header(flat, predicted) if predicted is not None else 0.0
-        if predicted is not None and contrast < SETTINGS.plain_header:
-            predicted, contrast = self._shifted(flat, predicted, contrast)
         if contrast <= SETTINGS.good_header:
             predicted, contrast = self._searched(flat, old, time, predicted, contrast)
         return predicted if contrast >= SETTINGS.min_header else None
@@ -316,22 +314,6 @@ class TrackedScreen:
             return predicted, contrast
         here = self._header(flat, found)
         return (found, here) if here > contrast + SETTINGS.better_header else (predicted, contrast)
-
-    def _shifted(self, flat: known_picture.ColumnLight, clock: Clock, contrast: float) -> tuple[Clock, float]:
-        """The clock, shifted to where its headers show plainly better, and their contrast.
-
-        If a camera stabilises the picture, its rows do not correspond to their read-out times.
-        """
-        best, most = clock, contrast
-        for step in (-SETTINGS.header_shift, SETTINGS.header_shift):
-            for n in range(1, SETTINGS.max_shifts + 1):
-                shifted = replace(clock, row0=clock.row0 + n * step * clock.rows_per_slot)
-                here = self._header(flat, shifted)
-                if here < most:
-                    break
-                best, most = shifted, here
-        plain = most > max(contrast + SETTINGS.better_header, SETTINGS.plain_header)
-        return (best, most) if plain else (clock, contrast)
 
     def _header(self, flat: known_picture.ColumnLight, clock: Clock) -> float:
         return known_picture.header_contrast(flat, known_picture.row_positions(self.rows, clock), clock)

@@ -56,10 +56,6 @@ class ClipSettings:
     frame_share: float = 0.2
     #: Contrast of its headers at which the predicted clock is accepted.
     good_header: float = 0.6
-    #: Contrast of its headers from which a predicted clock needs no shift; and step and number of shifts tried, slots.
-    plain_header: float = 0.8
-    header_shift: float = 0.3
-    max_shifts: int = 5
     #: Gain in header contrast at which another clock replaces the predicted one.
     better_header: float = 0.1
     #: Variance of a strip's light, at least: that of a starved clip's dark parts is none.
