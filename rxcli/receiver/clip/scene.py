@@ -53,8 +53,6 @@ class TrackedScreen:
         self._looked: FloatArray | None = None
         self._drift: FloatArray = np.zeros(2)
         self._begun_with = acquisition, black_level
-        #: Rows per slot of the frames so far.
-        self._rows_per_slot = acquisition.clock.rows_per_slot
         self._n_updates = 0
         #: Exposure of the last frame relative to that of the picture.
         self._gain = 1.0
@@ -211,8 +209,7 @@ class TrackedScreen:
             light /= np.float32(self._gain)
             flat = picture.solve(light)
         with timer("clock"):
-            old = replace(last.acquisition.clock, rows_per_slot=self._rows_per_slot)
-            clock = self._clock(frame, flat, old, time)
+            clock = self._clock(frame, flat, last.acquisition.clock, time)
             if clock is None:
                 return None
         with timer("detect"):
@@ -220,7 +217,6 @@ class TrackedScreen:
             if refined is None:
                 return None
             flat, clock, positions, likelihoods = refined
-            self._rows_per_slot += SETTINGS.frame_share * (clock.rows_per_slot - self._rows_per_slot)
             shown = _shown(pose.map.inside, positions, clock)
         return View(
             replace(last.context, frame=frame, corners=self.corners, timer=timer),
@@ -250,14 +246,9 @@ class TrackedScreen:
         None where the light does not fit what was decided: another scene, or something in front of the screen.
         """
         positions, exposure_slots = known_picture.row_positions(rows, clock), clock.exposure_slots
-        for _ in range(SETTINGS.retimings):
-            lit = known_picture.first_decision(flat, positions, clock) if known is None else known
-            slots = known_picture.exposures(lit, positions, exposure_slots)
-            fit = known_picture.fit_response(flat, slots)
-            if abs(fit.drift) <= SETTINGS.late_slots:
-                break
-            clock = _retimed(clock, rows, fit)
-            positions = known_picture.row_positions(rows, clock)
+        lit = known_picture.first_decision(flat, positions, clock) if known is None else known
+        slots = known_picture.exposures(lit, positions, exposure_slots)
+        fit = known_picture.fit_response(flat, slots)
         if fit.response.centre < SETTINGS.faded:
             expected = known_picture.expected_light(lit, positions, exposure_slots, isi_memory, fit.response)
             flat = picture.solve_again(light, expected.light, clock.rows_per_slot)
@@ -412,14 +403,6 @@ def followed_outline(frame: Frame, corners: FloatArray, screen: ScreenProfile) -
     layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
     found = follow_outline(plane.read_plane(frame), stored, layout)
     return None if found is None else found[order]
-
-
-def _retimed(clock: Clock, rows: FloatArray, fit: known_picture.Fit) -> Clock:
-    """Correct the clock by a fit, for rows that were stretched after they were read."""
-    middle, half = (rows[0] + rows[-1]) / 2, (rows[-1] - rows[0]) / 2
-    rows_per_slot = 1 / (1 / clock.rows_per_slot + fit.drift / half)
-    at_middle = (middle - clock.row0) / clock.rows_per_slot + fit.late
-    return replace(clock, row0=float(middle - at_middle * rows_per_slot), rows_per_slot=float(rows_per_slot))
 
 
 def _less_ends(inside: BoolArray, rows: float) -> BoolArray:

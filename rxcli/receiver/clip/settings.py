@@ -45,14 +45,11 @@ class ClipSettings:
     #: compression has taken much of it.
     min_header: float = 0.3
     faded: float = 0.85
-    #: Minimum lateness that is corrected, in slots, of the clock and of its drift from the middle to the last row: rows
-    #: that are instants drift by 0.02 at most, rows stretched by stabilisation by 0.1 to 0.4. Maximum number of
-    #: corrections.
+    #: Minimum lateness of the clock that is corrected, slots.
     late_slots: float = 0.03
-    retimings: int = 4
     #: Change of the exposure from which light is scaled to that of the picture; weights change it by up to 0.15.
     exposure_change: float = 0.3
-    #: Share of a frame's noise, and of its rows per slot, in what is expected of the next.
+    #: Share of a frame's noise in what is expected of the next.
     frame_share: float = 0.2
     #: Contrast of its headers at which the predicted clock is accepted.
     good_header: float = 0.6

@@ -15,7 +15,7 @@ from rxcli.types import Float32Array, FloatArray, IntArray
 #: Approximate number of values from which a response is fitted; and the golden ratio, whose multiples are spread evenly
 #: modulo 1.
 _SAMPLES_OF_RESPONSE, _GOLDEN = 2000, 0.6180339887
-#: (2, 5) lower and upper limits of centre, side, offset, lateness and drift.
+#: (2, 4) lower and upper limits of centre, side, offset and lateness.
 _BOUNDS = np.transpose(SETTINGS.response_bounds)
 
 
@@ -55,10 +55,8 @@ class Fit:
     """Fitted response of a frame."""
 
     response: Response
-    #: Lateness of the clock, slots, and its drift from the middle to the last row, which occurs if the camera stretched
-    #: the picture after readout.
+    #: Lateness of the clock, slots.
     late: float
-    drift: float
 
 
 def fit_response(observed: ColumnLight, slots: Exposures) -> Fit:
@@ -69,8 +67,7 @@ def fit_response(observed: ColumnLight, slots: Exposures) -> Fit:
         slots: exposed slots of the rows.
     """
     value, precision = (values.take(slots.rows, axis=1).ravel() for values in (observed.value, observed.precision))
-    down = np.linspace(-1, 1, slots.rows.size, dtype=np.float32)
-    terms = [slots.here, slots.beside, np.ones_like(slots.here), slots.slope, slots.slope * down]
+    terms = [slots.here, slots.beside, np.ones_like(slots.here), slots.slope]
     parts = np.stack(terms).reshape(len(terms), -1)
     weighted = parts * precision
     weight = float(precision.sum()) + 1e-9
@@ -78,6 +75,6 @@ def fit_response(observed: ColumnLight, slots: Exposures) -> Fit:
     # Regularised towards no blur.
     fitted = np.linalg.solve(normal + SETTINGS.response_ridge * np.eye(len(normal)), right - normal[:, 0])
     fitted[0] += 1
-    fitted[3:] /= max(fitted[0] + 2 * fitted[1], SETTINGS.response_bounds[0][0])
-    *response, late, drift = np.clip(fitted, *_BOUNDS).tolist()
-    return Fit(Response(*response), late, drift)
+    fitted[3] /= max(fitted[0] + 2 * fitted[1], SETTINGS.response_bounds[0][0])
+    *response, late = np.clip(fitted, *_BOUNDS).tolist()
+    return Fit(Response(*response), late)

@@ -44,9 +44,9 @@ class KnownPictureSettings:
     mean_error_slots: float = 20.0
     min_correlated_error: float = 0.9
 
-    #: Limits of the centre, the side and the offset of a response, and of one correction of the clock and of its drift
-    #: in slots; and the ridge of their fit.
-    response_bounds: tuple[tuple[float, float], ...] = ((0.3, 1.3), (-0.1, 0.35), (-0.2, 0.2), (-0.4, 0.4), (-0.4, 0.4))
+    #: Limits of the centre, the side and the offset of a response, and of one correction of the clock in slots; and the
+    #: ridge of their fit.
+    response_bounds: tuple[tuple[float, float], ...] = ((0.3, 1.3), (-0.1, 0.35), (-0.2, 0.2), (-0.4, 0.4))
     response_ridge: float = 1e-4
 
     #: Minimum number of dark rows of a strip, over all frames, for its dark light.
