@@ -49,9 +49,6 @@ class TrackedScreen:
         #: Looks in a row that found it where it was, and frames since the last one.
         self._n_rested = self._n_unlooked = 0
         self._still_outline: FloatArray | None = None
-        #: Where its outline was when looked at last, and how far it moves from frame to frame since.
-        self._looked: FloatArray | None = None
-        self._drift: FloatArray = np.zeros(2)
         self._begun_with = acquisition, black_level
         self._n_updates = 0
         #: Exposure of the last frame relative to that of the picture.
@@ -92,8 +89,8 @@ class TrackedScreen:
         found = self._texture.find(frame)
         confirmed = found.fits
         if not found.is_precise:
-            possible = _is_possible(self._expected - found.corners, found.covariance)
-            outline = self._outline_near(frame, self._expected, surprised=not possible)
+            possible = _is_possible(self.corners - found.corners, found.covariance)
+            outline = self._outline_near(frame, surprised=not possible)
             confirmed = confirmed or outline is not None or self._named
             found = self._by_outline(found, outline)
         if not confirmed:
@@ -109,9 +106,9 @@ class TrackedScreen:
 
     def _by_outline(self, found: Registration, outline: FloatArray | None) -> Registration:
         """Position of a screen with too little texture: at rest, unless its outline indicates a motion."""
-        at_rest = self._texture.with_outline(found, self._expected, SETTINGS.rest_sd)
-        if self._rests or _is_possible(self._expected - found.corners, found.covariance):
-            at_rest = replace(at_rest, corners=self._expected)
+        at_rest = self._texture.with_outline(found, self.corners, SETTINGS.rest_sd)
+        if self._rests or _is_possible(self.corners - found.corners, found.covariance):
+            at_rest = replace(at_rest, corners=self.corners)
         if self._rests:
             return at_rest
         # It may have moved since the last look as far as the outline errs.
@@ -119,9 +116,6 @@ class TrackedScreen:
         if outline is not None:
             far = np.abs(outline - corners).max() > SETTINGS.same_outline * self._width
             corners = outline if far else (corners + outline) / 2
-            if self._looked is not None:
-                self._drift = (corners - self._looked).mean(axis=0) * (SETTINGS.drift_share / 2)
-            self._looked = corners
         return replace(at_rest, corners=corners, covariance=np.eye(8) * (SETTINGS.moving_sd * self._width) ** 2)
 
     @property
@@ -129,12 +123,7 @@ class TrackedScreen:
         """Whether a screen that its picture does not locate is taken to rest."""
         return self._named or self._n_still >= SETTINGS.still_looks
 
-    @property
-    def _expected(self) -> FloatArray:
-        """(4, 2) expected corners of a screen that its picture does not locate."""
-        return self.corners if self._rests else self.corners + self._drift
-
-    def _outline_near(self, frame: Frame, corners: FloatArray, surprised: bool) -> FloatArray | None:
+    def _outline_near(self, frame: Frame, surprised: bool) -> FloatArray | None:
         """Corners (4, 2) by the outline, for a screen that its picture does not locate, or None.
 
         It is looked for in every other frame, and less often as long as it stays where it is and nothing is a surprise.
@@ -142,10 +131,10 @@ class TrackedScreen:
         self._n_imprecise += 1
         if self._n_imprecise % (SETTINGS.look_every if self._n_still >= SETTINGS.still_looks and not surprised else 2):
             return None
-        outline = followed_outline(frame, corners, self._begun_with[0].screen)
+        outline = followed_outline(frame, self.corners, self._begun_with[0].screen)
         if outline is None:
             return None
-        moved = outline - corners
+        moved = outline - self.corners
         if np.abs(moved).max() > 2 * SETTINGS.outline_reach * self._width:
             return None
         if np.abs(moved - moved.mean(axis=0)).max() > SETTINGS.bent_outline * self._width:  # the edge of something else

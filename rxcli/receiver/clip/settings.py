@@ -19,8 +19,6 @@ class ClipSettings:
     rest_sd: float = 0.0005
     rest_sds: float = 4.0
     moving_sd: float = 0.003
-    #: Share of its motion between two looks that a screen is expected to repeat.
-    drift_share: float = 0.7
     #: Rows at the screen's ends that are not counted on where a screen moves, least and most, beside one standard
     #: deviation of the corners. A row beyond the end is dark, whatever the known picture expects there.
     min_end_rows: float = 1.0
