@@ -134,10 +134,7 @@ class TrackedScreen:
         outline = followed_outline(frame, self.corners, self._begun_with[0].screen)
         if outline is None:
             return None
-        moved = outline - self.corners
-        if np.abs(moved).max() > 2 * SETTINGS.outline_reach * self._width:
-            return None
-        if np.abs(moved - moved.mean(axis=0)).max() > SETTINGS.bent_outline * self._width:  # the edge of something else
+        if np.abs(outline - self.corners).max() > 2 * SETTINGS.outline_reach * self._width:
             return None
         before = self._still_outline
         if before is None or np.abs(outline - before).max() > SETTINGS.same_outline * self._width:

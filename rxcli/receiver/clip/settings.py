@@ -30,8 +30,6 @@ class ClipSettings:
     #: from one frame to the next to be found.
     same_outline: float = 0.005
     outline_reach: float = 0.02
-    #: How much of its shape an outline may lose or win between two looks, in screen widths.
-    bent_outline: float = 0.012
     #: Frames from which the picture is learned one by one, and how often from then on.
     first_updates: int = 12
     update_every: int = 12
