@@ -189,14 +189,15 @@ class Server:
             app, access_log=None, keepalive_timeout=site.bounds.idle_s, logger=_requests_log(), shutdown_timeout=1.0
         )
         await self._runner.setup()
+        # Before the first upload: this process removes uploads if the server is killed.
+        loop = asyncio.get_running_loop()
+        await loop.run_in_executor(self._thread, self._decoder.start)
         try:
             await web.TCPSite(self._runner, site.host, site.port, backlog=32).start()
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise UsageError(f"cannot serve at {site.host}:{site.port} ({reason})", "choose another --port") from None
         self.port = self._runner.addresses[0][1]
-        loop = asyncio.get_running_loop()
-        loop.run_in_executor(self._thread, self._decoder.start)
         self._sweeper = asyncio.create_task(self._sweep())
         if site.device is not None:
             from rxcli.web.live import LiveCamera
