@@ -20,6 +20,8 @@ _PARTS, _LEVEL_PARTS = 8, 16
 #: Scales of the exponential distributions of the light's significance, off the screen and on it; log-odds that a part
 #: without light is off the screen; weight of a part, as neighbouring parts are not independent.
 _OFF_SCALE, _LIT_SCALE, _DARK_PART, _PART_COUNTS = 1.2, 6.0, 0.25, 0.5
+#: Light of one grey level of 255; log-odds from which the light of a part is steady, and their maximum.
+_GREY_LEVEL, _STEADY, _MAX_STEADY = 255.0**-2, 1.0, 3.0
 #: Minimum mean log-odds of parts of a column that belong to the light.
 _ENDS = 0.05
 #: Log-odds of each column outside the picture, and their minimum at ends of the picture that light reaches.
@@ -32,10 +34,11 @@ _IN_VIEW = 0.3
 #: that this adds.
 _BEGINS_ODDS, _BEYOND, _ON_BORDER = 2.0, 0.3, 3.0
 #: A bright picture has dark on both sides. It begins where its level exceeds this share between dark and bright
-#: (percentiles over the columns). The level left over at this distance beside it, its maximum offset from the screen's
-#: middle, columns, and the log-odds that it adds.
-_DARK, _BRIGHT, _BEGINS = 5, 75, 0.25
-_LEFT_OVER, _BESIDE, _IN_MIDDLE, _FILM = 0.12, 0.45, 0.2, 3.5
+#: (percentiles over the columns). The level left over at this distance beside it, columns.
+_DARK, _BRIGHT, _BEGINS, _LEFT_OVER, _BESIDE = 5, 75, 0.25, 0.12, 0.45
+#: Maximum width, screen widths, and maximum offset from the screen's middle, columns, of what lies in the middle of a
+#: screen, and the log-odds that it adds.
+_MAX_SPAN, _IN_MIDDLE, _CENTRED = 1.15, 0.2, 3.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +50,9 @@ class LightProfile:
     in_picture: BoolArray
     #: (P,) log-odds that a part is on the screen.
     log_odds: FloatArray
-    #: Columns at which a bright picture with dark on both sides begins and ends, or None.
-    film: tuple[float, float] | None
+    #: Columns at which begins and ends what probably lies in the screen's middle: a bright picture with dark on both
+    #: sides, and the screen with its frame in a lighted room.
+    spans: tuple[tuple[float, float], ...]
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -80,10 +84,36 @@ def light_profile(strips: Strips, light: Float32Array, grid: Grid) -> LightProfi
     off = np.exp(-significance / _OFF_SCALE) / _OFF_SCALE + TINY
     lit = np.exp(-significance / _LIT_SCALE) / _LIT_SCALE
     odds = _PART_COUNTS * np.log(np.exp(-_DARK_PART) + (1 - np.exp(-_DARK_PART)) * lit / off)
+    steady = _steady_light(strips, part, odds)
+    odds -= _PART_COUNTS * steady
     place = origin + (np.arange(n) + 0.5) / _PARTS
     by_block = np.maximum(light.mean(axis=(1, 2)), 0.0)
-    film = _film(np.where(by_block[:, None] > 0, strips.level, 0), u)
-    return LightProfile(place, count > 0, np.where(count > 0, odds, 0.0), film)
+    spans = _film(np.where(by_block[:, None] > 0, strips.level, 0), u), _framed(place, odds, steady)
+    return LightProfile(place, count > 0, np.where(count > 0, odds, 0.0), tuple(filter(None, spans)))
+
+
+def _steady_light(strips: Strips, part: IntArray, odds: FloatArray) -> FloatArray:
+    """(P,) log-odds that a part without light of the columns is off the screen, by the light that never goes out there.
+
+    The screen is dark whenever all its columns are; a room is not.
+    """
+    darkest = np.full(odds.size, np.inf)
+    np.minimum.at(darkest, part, strips.darkest.ravel())
+    of_columns = darkest[odds > 0]
+    if of_columns.size == 0:
+        return np.zeros(odds.size)
+    ratio = (darkest + _GREY_LEVEL) / (float(np.median(of_columns)) + _GREY_LEVEL)
+    return np.where((odds < 0) & np.isfinite(darkest), np.clip(np.log(ratio), 0, _MAX_STEADY), 0.0)
+
+
+def _framed(place: FloatArray, odds: FloatArray, steady: FloatArray) -> tuple[float, float] | None:
+    """Columns between which no light is steady around that of the columns, or None where it is not on both sides."""
+    if not (odds > 0).any():
+        return None
+    middle = np.median(place[odds > 0])
+    beside = place[steady > _STEADY]
+    left, right = beside[beside < middle], beside[beside > middle]
+    return (float(left.max()), float(right.min())) if left.size and right.size else None
 
 
 def _film(level: Float32Array, u: FloatArray) -> tuple[float, float] | None:
@@ -138,8 +168,9 @@ def first_columns(light: LightProfile, n_columns: int) -> FirstColumns:
     hidden = np.maximum(np.stack([left - starts, ends - right]), 0.0)
     odds += _OUTSIDE * (~reaches @ hidden) + np.maximum(_OUTSIDE * (reaches @ hidden), _LARGER)
     odds += _ON_BORDER * (_begins(light, starts, 1) + 1.0 * _begins(light, ends, -1))
-    if light.film is not None:
-        odds += _FILM * (np.abs(sum(light.film) / 2 - middles) < _IN_MIDDLE)
+    for span in light.spans:
+        if span[1] - span[0] < _MAX_SPAN * n_columns:
+            odds += _CENTRED * (np.abs(sum(span) / 2 - middles) < _IN_MIDDLE)
     return FirstColumns(starts, odds, bool(reaches.all()))
 
 

@@ -23,7 +23,7 @@ _Real = TypeVar("_Real", np.float32, np.float64)
 #: Averaged rows whose mean the band pass takes off.
 LONG_ROWS = 8
 #: Arrays by block and strip.
-_OF_STRIPS = ("changes", "lit", "level", "raw_x", "raw_y", "x", "y")
+_OF_STRIPS = ("changes", "lit", "level", "darkest", "raw_x", "raw_y", "x", "y")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +36,8 @@ class Strips:
     lit: Float32Array
     #: (B, S) float32: mean light, as encoded pixel values.
     level: Float32Array
+    #: (B, S) float32: light at the darkest instant, roughly linear, of white.
+    darkest: Float32Array
     #: (B, S): middles of the strips, offsets from the picture's middle in picture widths: in the stored picture, and
     #: with the distortion of a known lens removed.
     raw_x: FloatArray
@@ -132,6 +134,7 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
         parted(changes),
         parted(lit),
         parted(means.reshape(x.size, n_windows, rows).mean(axis=2).T),
+        parted(_roughly_linear(plane, means.reshape(x.size, n_windows, rows).min(axis=2).T)),
         raw_x,
         raw_y,
         x_flat,
@@ -157,6 +160,12 @@ def _light_of_strips(plane: LightPlane, n_parts: int) -> tuple[Float32Array, Flo
     light = np.diff(plane.sums[start : start + n * cells + 1 : cells], axis=0)
     light /= np.float32(cells * plane.cell_px)
     return light, np.asarray((start + (np.arange(n) + 0.5) * cells) * plane.cell_px - 0.5)
+
+
+def _roughly_linear(plane: LightPlane, values: Float32Array) -> Float32Array:
+    """Light of values of the plane, 0 black to 1 white; any usual tone curve is near a square root."""
+    shown = np.clip((values - np.float32(plane.black)) / np.float32(plane.white - plane.black), 0, 1)
+    return np.asarray(shown if plane.is_linear else shown * shown, np.float32)
 
 
 def flat_places(points: FloatArray, width: int, height: int, lens: Lens | None) -> tuple[FloatArray, FloatArray]:

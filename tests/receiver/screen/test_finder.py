@@ -48,10 +48,12 @@ def draw(
     bend: float = 0.0,
     seed: int = 0,
     size: tuple[int, int] = (HEIGHT, WIDTH),
+    room: float = 0.0,
 ) -> NDArray[np.uint8]:
-    """Luma of a screen whose columns send random slots behind a picture, in a dark room, with row noise.
+    """Luma of a screen whose columns send random slots behind a picture, with row noise.
 
-    `bend`: of a picture that was corrected in the camera, see `strips`.
+    `bend`: of a picture that was corrected in the camera, see `strips`. `room`: grey levels of the room around the
+    screen and its dark frame.
     """
     height, width = size
     rng = np.random.default_rng(seed)
@@ -68,7 +70,13 @@ def draw(
         spread = np.exp(-((n_columns * u - own - beside - 0.5) ** 2) / (2 * 0.47**2))
         light += spread * sent[slot, own + beside + 3]
     light *= shown(picture, u, v) * ((u > 0) & (u < 1) & (v > 0) & (v < 1))
-    luma = 150 * light + 12 + rng.normal(0, 4, u.shape) + rng.normal(0, 0.5, (height, 1))
+    luma = (
+        150 * light
+        + 12
+        + room * ((np.abs(u - 0.5) > 0.53) | (np.abs(v - 0.5) > 0.55))
+        + rng.normal(0, 4, u.shape)
+        + rng.normal(0, 0.5, (height, 1))
+    )
     return np.clip(luma, 0, 255).astype(np.uint8)
 
 
@@ -276,10 +284,9 @@ def test_columns_with_light_are_told_from_those_without() -> None:
 
 
 def test_a_film_has_sharp_ends_and_fading_light_has_none() -> None:
-    film = profile_of("film").film
-    assert film is not None
+    (film,) = profile_of("film").spans
     np.testing.assert_allclose(film, (2.6, 17.4), atol=0.3)
-    assert profile_of("fading").film is None
+    assert not profile_of("fading").spans
     start = first_columns(profile_of("film"), 20)
     assert start.columns[start.log_odds.argmax()] == 0
 
@@ -288,16 +295,26 @@ def test_a_film_has_sharp_ends_and_fading_light_has_none() -> None:
 def test_narrow_bars_on_both_sides_show_the_first_column(film: tuple[float, float]) -> None:
     place = (np.arange(-16, 22 * 8) + 0.5) / 8
     light = np.where((place > 1.5) & (place < 18.5), 2.0, 0.0)
-    start = first_columns(LightProfile(place, np.ones(place.size, bool), light, film), 20)
+    start = first_columns(LightProfile(place, np.ones(place.size, bool), light, (film,)), 20)
     in_doubt = (start.log_odds > start.log_odds.max() - 2).sum() > 1
     assert start.columns[start.log_odds.argmax()] == 0 or in_doubt
     assert in_doubt == (sum(film) != 20)
 
 
+def test_steady_light_around_the_screen_shows_the_first_column() -> None:
+    dark, lighted = (find_outlines(drawn("dark sides", room=room), [WIDE]) for room in (0.0, 30.0))
+    certainty = [
+        1 / np.exp([one.log_odds - candidates[0].log_odds for one in candidates]).sum()
+        for candidates in (dark, lighted)
+    ]
+    assert round(float(np.median(apart(lighted[0])))) == 0
+    assert certainty[0] < 0.9 < 0.95 < certainty[1]
+
+
 def test_light_that_ends_just_before_the_edge_of_the_picture_ends_on_the_screen() -> None:
     place = (np.arange(-8, 20 * 8 + 3) + 0.5) / 8
     light = np.where((place > 7) & (place < 20), 1.3, -0.1)
-    start = first_columns(LightProfile(place, np.ones(place.size, bool), light, None), 20)
+    start = first_columns(LightProfile(place, np.ones(place.size, bool), light, ()), 20)
     assert start.columns[start.log_odds.argmax()] == 0
     assert not start.fills
 
