@@ -409,7 +409,8 @@ def similarity(copy_a: NDArray[np.floating], copy_b: NDArray[np.floating]) -> fl
     """Log-likelihood ratio of two copies being the same packet against different ones.
 
     Two slots lit with probabilities p and q are equal with likelihood p q / r + (1 - p)(1 - q) / (1 - r) relative to
-    independent slots, where r is the column's share of lit slots.
+    independent slots, where r is the column's share of lit slots. At an edge of the picture a slot is misread in all
+    columns, so one slot tells little against the same packet.
 
     Args:
         copy_a: (C, packet) log-likelihood ratio of each slot being lit, 0 where not visible.
@@ -420,4 +421,5 @@ def similarity(copy_a: NDArray[np.floating], copy_b: NDArray[np.floating]) -> fl
     p, q = 1 / (1 + np.exp(-llr_a)), 1 / (1 + np.exp(-llr_b))
     share = ((p + q) * common).sum(axis=1, keepdims=True) / np.maximum(2 * common.sum(axis=1, keepdims=True), 1)
     share = np.clip(share, 0.1, 0.9)
-    return float((np.log(p * q / share + (1 - p) * (1 - q) / (1 - share)) * common).sum())
+    of_slots = (np.log(p * q / share + (1 - p) * (1 - q) / (1 - share)) * common).sum(axis=0)
+    return float(np.logaddexp(np.log(1 - SETTINGS.misread_slots) + of_slots, np.log(SETTINGS.misread_slots)).sum())

@@ -36,8 +36,10 @@ class SyncSettings:
 
     #: Limit of a slot's log-likelihood ratio when copies are compared.
     max_slot_llr: float = 3.0
+    #: Share of the slots that are misread in all columns of a copy.
+    misread_slots: float = 0.1
     #: Log-likelihood ratio at which the phase of the bursts is settled.
-    settled_llr: float = 12.0
+    settled_llr: float = 24.0
 
     #: Largest deviation, slots, of a clock from the prediction of earlier frames; beyond it the link time is lost.
     max_jump_slots: float = 2.0
