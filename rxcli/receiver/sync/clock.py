@@ -410,7 +410,7 @@ def similarity(copy_a: NDArray[np.floating], copy_b: NDArray[np.floating]) -> fl
 
     Two slots lit with probabilities p and q are equal with likelihood p q / r + (1 - p)(1 - q) / (1 - r) relative to
     independent slots, where r is the column's share of lit slots. At an edge of the picture a slot is misread in all
-    columns, so one slot tells little against the same packet.
+    columns together, so that one slot says little, whatever its columns say.
 
     Args:
         copy_a: (C, packet) log-likelihood ratio of each slot being lit, 0 where not visible.
@@ -422,4 +422,5 @@ def similarity(copy_a: NDArray[np.floating], copy_b: NDArray[np.floating]) -> fl
     share = ((p + q) * common).sum(axis=1, keepdims=True) / np.maximum(2 * common.sum(axis=1, keepdims=True), 1)
     share = np.clip(share, 0.1, 0.9)
     of_slots = (np.log(p * q / share + (1 - p) * (1 - q) / (1 - share)) * common).sum(axis=0)
-    return float(np.logaddexp(np.log(1 - SETTINGS.misread_slots) + of_slots, np.log(SETTINGS.misread_slots)).sum())
+    right, misread = np.log(1 - SETTINGS.misread_slots), np.log(SETTINGS.misread_slots)
+    return float((np.logaddexp(right + of_slots, misread) - np.logaddexp(right, misread + of_slots)).sum())
