@@ -31,8 +31,12 @@ def score(reception: Reception, evidence: float, log_prior: float) -> float:
         evidence: see `log_evidence`.
         log_prior: of the hypothesis.
     """
-    complete = SETTINGS.complete_packet * bool(reception.is_complete.any())
-    return SETTINGS.temper * (distinct_share(reception) * evidence + complete) + log_prior
+    return SETTINGS.temper * (distinct_share(reception) * evidence + completeness(reception)) + log_prior
+
+
+def completeness(reception: Reception) -> float:
+    """Evidence that a complete packet adds."""
+    return SETTINGS.complete_packet * bool(reception.is_complete.any())
 
 
 def middle_score(scored: Scored) -> float:

@@ -241,4 +241,5 @@ def _in_likeliest_bursts(scored: Scored) -> Scored:
     hypothesis, context, acquisition = scored.hypothesis, scored.context, scored.acquisition
     receptions = in_other_bursts(acquisition, scored.reception)
     rivals = (_rated(hypothesis, context, acquisition, reception) for reception in receptions)
-    return max([scored, *rivals], key=lambda rival: rival.score)
+    # Not by score: it distrusts columns that send the same, and wrong bursts make them differ.
+    return max([scored, *rivals], key=lambda rival: rival.evidence + evidence.completeness(rival.reception))

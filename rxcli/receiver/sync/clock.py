@@ -410,7 +410,7 @@ def similarity(copy_a: NDArray[np.floating], copy_b: NDArray[np.floating]) -> fl
 
     Two slots lit with probabilities p and q are equal with likelihood p q / r + (1 - p)(1 - q) / (1 - r) relative to
     independent slots, where r is the column's share of lit slots. At an edge of the picture a slot is misread in all
-    columns together, so that one slot says little, whatever its columns say.
+    columns together: a slot counts for little, whatever its columns show.
 
     Args:
         copy_a: (C, packet) log-likelihood ratio of each slot being lit, 0 where not visible.
