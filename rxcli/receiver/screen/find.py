@@ -92,7 +92,7 @@ def find_screens(
     screens = _screens_apart(strips, wide) if wide else []
     if screens:
         return screens
-    if narrow and shows_narrow_columns(strips):
+    if narrow and shows_narrow_columns(strips.without_common_light()):
         fine = read_strips(plane, lens, n_parts=_PARTS)
         grid = narrow_grid(fine, narrow[0].sigma, at_bright_part(narrow[0]))
         if grid is not None:

@@ -22,6 +22,8 @@ from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 _Real = TypeVar("_Real", np.float32, np.float64)
 #: Averaged rows whose mean the band pass takes off.
 LONG_ROWS = 8
+#: Share of a strip's power that may be due to rounding.
+_ROUNDING = 1e-6
 #: Arrays by block and strip.
 _OF_STRIPS = ("changes", "lit", "level", "darkest", "raw_x", "raw_y", "x", "y")
 
@@ -78,6 +80,13 @@ class Strips:
         """(B, S - distance) coherence of strips with those `distance` strips to their right."""
         pairs = np.einsum("bsr,bsr->bs", self.changes[:, :-distance], self.changes[:, distance:])
         return np.asarray(pairs / np.float32(self.changes.shape[2]), np.float32)
+
+    def without_common_light(self) -> Strips:
+        """The same without the light that all columns share, as of headers and lamps: it shows no borders."""
+        common = np.einsum("bsr,bs->br", self.changes, self.lit)
+        changes = _of_unit_power(_without(self.changes, common), _ROUNDING)
+        lit = _lit(changes)
+        return replace(self, changes=changes, lit=lit, n_rows=_independent_rows(changes, lit))
 
     def blocks(self, chosen: slice | NDArray[np.int64]) -> Strips:
         """Some of the blocks."""
@@ -221,10 +230,7 @@ def _short_rows(light: Float32Array) -> int:
 
 def _windows(band: Float32Array, n_windows: int) -> Float32Array:
     """(W, S, R) windows of rows, each strip scaled to a mean square of one."""
-    changes = np.ascontiguousarray(band.reshape(len(band), n_windows, -1).swapaxes(0, 1))
-    power = np.einsum("wsr,wsr->ws", changes, changes) / np.float32(changes.shape[2])
-    changes /= (np.sqrt(power) + np.float32(TINY))[..., None]
-    return changes
+    return _of_unit_power(np.ascontiguousarray(band.reshape(len(band), n_windows, -1).swapaxes(0, 1)), TINY)
 
 
 def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
@@ -232,10 +238,27 @@ def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Arra
     n_dark = max(int(SETTINGS.dark_share * changes.shape[1]), 1)
     dark = np.argsort(_smooth(_neighbours(changes), 5, 1), axis=1)[:, :n_dark]
     noise = np.take_along_axis(changes, dark[..., None], axis=1).mean(axis=1)
-    power = np.einsum("wr,wr->w", noise, noise) + np.float32(TINY)
-    share = np.matmul(changes, noise[..., None]) / power[:, None, None]
-    quiet = np.asarray(changes - share * noise[:, None], np.float32)
-    return quiet, np.clip(_smooth(_neighbours(quiet), 3, 3), 0, 1), noise
+    quiet = _without(changes, noise)
+    return quiet, _lit(quiet), noise
+
+
+def _without(changes: Float32Array, part: Float32Array) -> Float32Array:
+    """Project (B, R) off the strips (B, S, R) of each block; strips remain the same mixes of what remains of columns."""
+    power = np.einsum("br,br->b", part, part) + np.float32(TINY)
+    share = np.matmul(changes, part[..., None]) / power[:, None, None]
+    return np.asarray(changes - share * part[:, None], np.float32)
+
+
+def _of_unit_power(changes: Float32Array, least: float) -> Float32Array:
+    """Scale strips (B, S, R) to a mean square of one along the rows, in place; much less than `least` stays small."""
+    power = np.einsum("bsr,bsr->bs", changes, changes) / np.float32(changes.shape[2])
+    changes /= np.sqrt(power + np.float32(least))[..., None]
+    return changes
+
+
+def _lit(changes: Float32Array) -> Float32Array:
+    """(B, S) coherence of each strip's neighbours, 0..1."""
+    return np.clip(_smooth(_neighbours(changes), 3, 3), 0, 1)
 
 
 def _neighbours(changes: Float32Array) -> Float32Array:
