@@ -83,9 +83,10 @@ class Strips:
 
     def without_common_light(self) -> Strips:
         """The same without the light that all columns share, as of headers and lamps: it shows no borders."""
-        common = np.einsum("bsr,bs->br", self.changes, self.lit)
-        changes = _of_unit_power(_without(self.changes, common), _ROUNDING)
-        lit = _lit(changes)
+        changes = _without(self.changes, np.einsum("bsr,bs->br", self.changes, self.lit))
+        left = _power(changes)
+        changes /= np.sqrt(left + np.float32(_ROUNDING))[..., None]
+        lit = _lit(changes) * left
         return replace(self, changes=changes, lit=lit, n_rows=_independent_rows(changes, lit))
 
     def blocks(self, chosen: slice | NDArray[np.int64]) -> Strips:
@@ -230,7 +231,9 @@ def _short_rows(light: Float32Array) -> int:
 
 def _windows(band: Float32Array, n_windows: int) -> Float32Array:
     """(W, S, R) windows of rows, each strip scaled to a mean square of one."""
-    return _of_unit_power(np.ascontiguousarray(band.reshape(len(band), n_windows, -1).swapaxes(0, 1)), TINY)
+    changes = np.ascontiguousarray(band.reshape(len(band), n_windows, -1).swapaxes(0, 1))
+    changes /= (np.sqrt(_power(changes)) + np.float32(TINY))[..., None]
+    return changes
 
 
 def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
@@ -249,11 +252,9 @@ def _without(changes: Float32Array, part: Float32Array) -> Float32Array:
     return np.asarray(changes - share * part[:, None], np.float32)
 
 
-def _of_unit_power(changes: Float32Array, least: float) -> Float32Array:
-    """Scale strips (B, S, R) to a mean square of one along the rows, in place; much less than `least` stays small."""
-    power = np.einsum("bsr,bsr->bs", changes, changes) / np.float32(changes.shape[2])
-    changes /= np.sqrt(power + np.float32(least))[..., None]
-    return changes
+def _power(changes: Float32Array) -> Float32Array:
+    """(B, S) mean square of strips along the rows."""
+    return np.einsum("bsr,bsr->bs", changes, changes) / np.float32(changes.shape[2])
 
 
 def _lit(changes: Float32Array) -> Float32Array:
