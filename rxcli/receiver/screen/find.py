@@ -184,9 +184,14 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
 
 
 def shows_columns(plane: LightPlane, sigma: float) -> bool:
-    """Whether a picture shows wide columns."""
+    """Whether the strongest comb of wide columns in a picture stands out."""
     strips = _strips_of(plane)
-    return strips is not None and wide_grid(strips, sigma) is not None
+    combs = [] if strips is None else find_combs(strips, sigma)
+    if strips is None or not combs:
+        return False
+    some = strips.blocks(slice(None, None, 2))
+    grid = moved_by_waveforms(some, grid_of_comb(combs[0], strips), sigma, SETTINGS.first_steps)
+    return _stands_out(some, with_light(some, grid, sigma))
 
 
 def _score(grid: Grid) -> float:
@@ -224,7 +229,7 @@ def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
         reach *= SETTINGS.reach_gain
         within = np.abs(strips.raw_x - middle) < reach
         near = np.flatnonzero(within.any(axis=1))
-        grid = moved_by_waveforms(strips.blocks(near), grid, sigma, SETTINGS.first_steps, within[near])
+        grid = moved_by_waveforms(strips.blocks(near), grid, sigma, SETTINGS.last_steps, within[near])
     return grid
 
 
