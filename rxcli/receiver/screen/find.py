@@ -173,8 +173,7 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
     """
     some, combs = strips.blocks(slice(None, None, 2)), find_combs(strips, sigma)
     if combs and (strongest := with_light(some, grid_of_comb(combs[0], strips), sigma)).is_plain:
-        strongest = moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
-        return moved_by_waveforms(strips, strongest, sigma, SETTINGS.last_steps)
+        return moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
     best = max((with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs), key=_score, default=None)
     starts = [] if best is None else [moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)]
     starts += [rival] if rival is not None and with_light(some, rival, sigma).contrast > 0 else []
