@@ -246,7 +246,7 @@ def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Arra
 
 
 def _without(changes: Float32Array, part: Float32Array) -> Float32Array:
-    """Project (B, R) off the strips (B, S, R) of each block; strips remain the same mixes of what remains of columns."""
+    """Project (B, R) off the strips (B, S, R) of each block: the columns change, but not their mixes in the strips."""
     power = np.einsum("br,br->b", part, part) + np.float32(TINY)
     share = np.matmul(changes, part[..., None]) / power[:, None, None]
     return np.asarray(changes - share * part[:, None], np.float32)
