@@ -172,10 +172,13 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
         rival: a grid that competes with those of the combs, unless the strongest comb's is plain.
     """
     some, combs = strips.blocks(slice(None, None, 2)), find_combs(strips, sigma)
-    if combs and (strongest := with_light(some, grid_of_comb(combs[0], strips), sigma)).is_plain:
-        return moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
-    best = max((with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs), key=_score, default=None)
-    starts = [] if best is None else [moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)]
+    grids = (with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs)
+    starts: list[Grid] = []
+    if (strongest := next(grids, None)) is not None:
+        if strongest.contrast > SETTINGS.plain_contrast * strongest.explained:
+            return moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
+        best = max([strongest, *grids], key=_score)
+        starts.append(moved_by_waveforms(some, best, sigma, SETTINGS.first_steps))
     starts += [rival] if rival is not None and with_light(some, rival, sigma).contrast > 0 else []
     moved = [moved_by_waveforms(strips, grid, sigma, SETTINGS.last_steps) for grid in starts]
     settled = [with_light(strips, grid, sigma) for grid in moved]

@@ -63,8 +63,6 @@ class FinderSettings:
     ridge: float = 0.5
     #: Gain of a fit's steps: they are too short because the waveforms were estimated with the same grid.
     step_gain: float = 2.5
-    #: Standard deviations beyond which the weight of a strip's offset decreases.
-    huber_sd: float = 1.0
     #: Prior standard deviations of perspective and of radial distortion.
     perspective_sd: float = 0.15
     radial_sd: float = 0.004

@@ -9,7 +9,7 @@ fifth of the picture's width has finer strips and its own blocks; everything aft
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,19 +89,13 @@ class Strips:
         lit = _lit(changes) * left
         return replace(self, changes=changes, lit=lit, n_rows=_independent_rows(changes, lit))
 
-    def blocks(self, chosen: slice | NDArray[np.int64]) -> Strips:
-        """Some of the blocks."""
-        arrays = {name: getattr(self, name)[chosen] for name in _OF_STRIPS}
-        return replace(self, **arrays)
+    def blocks(self, chosen: Any) -> Strips:
+        """Some of the blocks, or of their strips, by an index of the first axis or of the first two."""
+        return replace(self, **{name: getattr(self, name)[chosen] for name in _OF_STRIPS})
 
     def part(self, number: int) -> Strips:
         """The blocks of one part of the width."""
         return self.blocks(slice(number * self.n_windows, (number + 1) * self.n_windows))
-
-    def between(self, start: int, end: int) -> Strips:
-        """The strips from `start` on, up to but without `end`, of every block."""
-        arrays = {name: getattr(self, name)[:, start:end] for name in _OF_STRIPS}
-        return replace(self, **arrays)
 
     def sides_of_gap(self) -> list[Strips]:
         """The strips on either side of the widest gap without coherent light, the gap in both; none without a gap."""
@@ -113,7 +107,7 @@ class Strips:
         start, end = max(edges.tolist(), key=lambda gap: gap[1] - gap[0], default=(0, 0))
         if (end - start) * self.step < SETTINGS.min_gap_widths or lit.mean() < SETTINGS.min_apart_light:
             return []
-        return [self.between(0, end), self.between(start, lit.size)]
+        return [self.blocks(np.s_[:, :end]), self.blocks(np.s_[:, start:])]
 
 
 def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1) -> Strips:
@@ -254,12 +248,12 @@ def _without(changes: Float32Array, part: Float32Array) -> Float32Array:
 
 def _power(changes: Float32Array) -> Float32Array:
     """(B, S) mean square of strips along the rows."""
-    return np.einsum("bsr,bsr->bs", changes, changes) / np.float32(changes.shape[2])
+    return np.asarray(np.einsum("bsr,bsr->bs", changes, changes) / np.float32(changes.shape[2]), np.float32)
 
 
 def _lit(changes: Float32Array) -> Float32Array:
     """(B, S) coherence of each strip's neighbours, 0..1."""
-    return np.clip(_smooth(_neighbours(changes), 3, 3), 0, 1)
+    return np.asarray(np.clip(_smooth(_neighbours(changes), 3, 3), 0, 1), np.float32)
 
 
 def _neighbours(changes: Float32Array) -> Float32Array:

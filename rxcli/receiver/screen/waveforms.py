@@ -153,32 +153,26 @@ def moved_by_waveforms(
 
 def _offsets(strips: Strips, mixes: Mixes) -> tuple[FloatArray, FloatArray]:
     """(B, S) offset of each strip from its position in a grid, columns, and the precision of the offset."""
-    off, precision = np.zeros(strips.x.shape), np.zeros(strips.x.shape)
-    slope, n = mixes.slopes(), strips.changes.shape[2]
+    off, precision, slope = np.zeros(strips.x.shape), np.zeros(strips.x.shape), mixes.slopes()
     for half, waves in _halves(strips, mixes):
-        predicted = _Predicted.of(waves, strips.changes[:, half])
-        off[:, half], precision[:, half] = _offsets_of(predicted, mixes.share[:, half], slope[:, half], n)
-    return off, _robust(off, precision * strips.n_rows / n)
+        found = offsets(waves, strips.changes[:, half], mixes.share[:, half], slope[:, half], strips.n_rows)
+        off[:, half], precision[:, half] = found
+    return off, precision
 
 
-def offsets_of_known(strips: Strips, mixes: Mixes, waves: Float32Array) -> tuple[FloatArray, FloatArray]:
-    """(B, S) offset of each strip from its position in a grid, by known waveforms (B, K, R), and its precision."""
-    n = strips.changes.shape[2]
-    predicted = _Predicted.of(waves, strips.changes)
-    off, precision = _offsets_of(predicted, mixes.share, mixes.slopes(), n)
-    return np.asarray(off, np.float64), _robust(off, np.asarray(precision * strips.n_rows / n, np.float64))
-
-
-def _robust(off: FloatArray | Float32Array, precision: FloatArray) -> FloatArray:
-    """Precision of offsets, reduced for outliers (Huber weights)."""
-    limit = SETTINGS.huber_sd / np.sqrt(np.maximum(precision, 1e-9))
-    return np.asarray(precision / np.maximum(np.abs(off) / limit, 1.0))
-
-
-def _offsets_of(
-    predicted: _Predicted, share: Float32Array, slope: Float32Array, n_rows: int
+def offsets(
+    waves: Float32Array, changes: Float32Array, share: Float32Array, slope: Float32Array, n_rows: float
 ) -> tuple[Float32Array, Float32Array]:
-    """Regress strips on their light and its slope along the screen: offset and its precision."""
+    """Regress strips on their light and its slope along the screen: (B, S) offset, columns, and its precision.
+
+    Args:
+        waves: (B, K, R) waveforms of the columns.
+        changes: (B, S, R) of the strips.
+        share: (B, S, K) of the columns in their light.
+        slope: (B, S, K) of the shares.
+        n_rows: independent rows of a block.
+    """
+    predicted = _Predicted.of(waves, changes)
     model = np.matmul(share, predicted.waves)
     power = _dot(model, share) + _TINY
     gain = _dot(predicted.strips, share) / power
