@@ -181,4 +181,6 @@ def offsets(
     projection = _dot(predicted.strips, slope) - shared * gain * power
     noise = np.maximum(predicted.power - gain * gain * power, 0) / np.float32(n_rows) + _TINY
     lit = np.maximum(gain, np.float32(0))
-    return projection / (np.maximum(lit, np.float32(0.05)) * slope_power), lit * lit * slope_power / noise
+    off, precision = projection / (np.maximum(lit, np.float32(0.05)) * slope_power), lit * lit * slope_power / noise
+    # Huber weights: offsets beyond one standard deviation count less.
+    return off, precision / np.maximum(np.abs(off) * np.sqrt(precision), 1)
