@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.receiver.light import SlotLight
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_slopes
@@ -100,6 +101,9 @@ def _waves(
 
     changes = mean(strips.short_rows) - mean(LONG_ROWS * strips.short_rows)
     changes = changes.reshape(n_columns, n_windows, n_rows).transpose(1, 0, 2)
+    noise = strips.row_noise / (np.linalg.norm(strips.row_noise, axis=1, keepdims=True) + np.float32(TINY))
+    # The row noise is projected off the strips, so it is projected off the waves.
+    changes = changes - np.einsum("wcr,wr->wc", changes, noise)[..., None] * noise[:, None]
     return np.asarray(np.where(np.abs(changes) < _MIN_WAVE, 0, changes), np.float32)
 
 

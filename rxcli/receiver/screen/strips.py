@@ -48,6 +48,8 @@ class Strips:
     y: FloatArray
     #: Half the height of a block, picture widths.
     half_height: float
+    #: (W, R) row noise that was projected off the strips of each window of rows.
+    row_noise: Float32Array
     #: Rows that the band pass averages: picture rows from one row of `changes` to the next.
     short_rows: int
     #: Independent rows of a block: an incoherent pair of strips has a variance of one over these.
@@ -123,7 +125,7 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
     rows = means.shape[1] // n_windows
     middles = (np.arange(n_windows) + 0.5) * rows * short - 0.5
     points = np.stack(np.meshgrid(x, middles), axis=-1)
-    changes, lit = _without_row_noise(_windows(_band_passed(light, means, short), n_windows))
+    changes, lit, noise = _without_row_noise(_windows(_band_passed(light, means, short), n_windows))
 
     def parted(values: NDArray[_Real]) -> NDArray[_Real]:
         """(W, S, ...) as (parts x W, S / parts, ...)."""
@@ -142,6 +144,7 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
         x_flat,
         y_flat,
         half_height=rows * short / 2 / plane.width,
+        row_noise=noise,
         short_rows=short,
         n_rows=_independent_rows(changes, lit),
         n_parts=n_parts,
@@ -227,12 +230,13 @@ def _windows(band: Float32Array, n_windows: int) -> Float32Array:
     return changes
 
 
-def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Remove the common part of the least coherent strips; returns changes and (W, S) coherence of neighbours."""
+def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Remove the common part of the least coherent strips: changes, (W, S) coherence of neighbours, (W, R) noise."""
     n_dark = max(int(SETTINGS.dark_share * changes.shape[1]), 1)
     dark = np.argsort(_smooth(_neighbours(changes), 5, 1), axis=1)[:, :n_dark]
-    quiet = _without(changes, np.take_along_axis(changes, dark[..., None], axis=1).mean(axis=1))
-    return quiet, _lit(quiet)
+    noise = np.take_along_axis(changes, dark[..., None], axis=1).mean(axis=1)
+    quiet = _without(changes, noise)
+    return quiet, _lit(quiet), noise
 
 
 def _without(changes: Float32Array, part: Float32Array) -> Float32Array:
