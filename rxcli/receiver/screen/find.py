@@ -176,7 +176,8 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
     starts: list[Grid] = []
     if (strongest := next(grids, None)) is not None:
         if strongest.contrast > SETTINGS.plain_contrast * strongest.explained:
-            return moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
+            strongest = moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
+            return moved_by_waveforms(strips, strongest, sigma, SETTINGS.last_steps)
         best = max([strongest, *grids], key=_score)
         starts.append(moved_by_waveforms(some, best, sigma, SETTINGS.first_steps))
     starts += [rival] if rival is not None and with_light(some, rival, sigma).contrast > 0 else []
