@@ -25,8 +25,8 @@ def bright_quadrilateral(plane: LightPlane) -> FloatArray | None:
 
     cells = max((len(plane.sums) - 1) // _WIDTH, 1)
     pixels = cells * plane.cell_px
-    light = np.diff(plane.sums[::cells], axis=0).T
-    small = cv2.resize(light, (light.shape[1], max(plane.height // pixels, 1)), interpolation=cv2.INTER_AREA)
+    light = np.diff(plane.sums[::cells], axis=0)
+    small = cv2.resize(light, (max(plane.height // pixels, 1), len(light)), interpolation=cv2.INTER_AREA).T
     small = np.clip(small * np.float32(255 / max(float(np.percentile(small, 99)), 1e-6)), 0, 255).astype(np.uint8)
     _, bright = cv2.threshold(small, 0, 255, cv2.THRESH_OTSU)
     padded = cv2.copyMakeBorder(bright, _FILLED, _FILLED, _FILLED, _FILLED, cv2.BORDER_CONSTANT, value=0)

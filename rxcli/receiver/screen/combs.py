@@ -62,7 +62,7 @@ def find_combs(strips: Strips, sigma: float) -> list[Comb]:
         sigma: light spread of the screen, column pitches.
     """
     chosen: list[Comb] = []
-    for comb in sorted(_all_combs(strips, sigma), key=lambda comb: -comb.score):
+    for comb in sorted(_all_combs(strips.without_common_light(), sigma), key=lambda comb: -comb.score):
         if not any(comb.is_like(earlier) for earlier in chosen):
             chosen.append(comb)
         if len(chosen) == SETTINGS.n_combs or chosen[0].score <= SETTINGS.min_comb:

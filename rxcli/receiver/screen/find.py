@@ -81,10 +81,6 @@ def find_screens(
         bright: corners (4, 2) of the bright part of the picture, clockwise from its top left, where borders of columns
             are looked for as well.
     """
-
-    def at_bright_part(layout: ColumnLayout) -> Grid | None:
-        return None if bright is None else grid_between(bright, layout.n_columns, (plane.width, plane.height), lens)
-
     strips = _strips_of(plane, lens)
     if strips is None:
         return []
@@ -92,12 +88,16 @@ def find_screens(
     screens = _screens_apart(strips, wide) if wide else []
     if screens:
         return screens
-    if narrow and shows_narrow_columns(strips):
+    if narrow and shows_narrow_columns(strips.without_common_light()):
         fine = read_strips(plane, lens, n_parts=_PARTS)
-        grid = narrow_grid(fine, narrow[0].sigma, at_bright_part(narrow[0]))
+        grid = narrow_grid(fine, narrow[0].sigma)
         if grid is not None:
             return [_numbered(fine, grid, narrow)]
-    grid = wide_grid(strips, wide[0].sigma, at_bright_part(wide[0])) if wide else None
+    if not wide:
+        return []
+    size = (plane.width, plane.height)
+    rival = None if bright is None else grid_between(bright, wide[0].n_columns, size, lens)
+    grid = wide_grid(strips, wide[0].sigma, rival)
     return [] if grid is None else [_numbered(strips, grid, wide)]
 
 
@@ -172,11 +172,14 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
         rival: a grid that competes with those of the combs, unless the strongest comb's is plain.
     """
     some, combs = strips.blocks(slice(None, None, 2)), find_combs(strips, sigma)
-    if combs and (strongest := with_light(some, grid_of_comb(combs[0], strips), sigma)).is_plain:
-        strongest = moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
-        return moved_by_waveforms(strips, strongest, sigma, SETTINGS.last_steps)
-    best = max((with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs), key=_score, default=None)
-    starts = [] if best is None else [moved_by_waveforms(some, best, sigma, SETTINGS.first_steps)]
+    grids = (with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs)
+    starts: list[Grid] = []
+    if (strongest := next(grids, None)) is not None:
+        if strongest.contrast > SETTINGS.plain_contrast * strongest.explained:
+            strongest = moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
+            return moved_by_waveforms(strips, strongest, sigma, SETTINGS.last_steps)
+        best = max([strongest, *grids], key=_score)
+        starts.append(moved_by_waveforms(some, best, sigma, SETTINGS.first_steps))
     starts += [rival] if rival is not None and with_light(some, rival, sigma).contrast > 0 else []
     moved = [moved_by_waveforms(strips, grid, sigma, SETTINGS.last_steps) for grid in starts]
     settled = [with_light(strips, grid, sigma) for grid in moved]
@@ -184,9 +187,14 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
 
 
 def shows_columns(plane: LightPlane, sigma: float) -> bool:
-    """Whether a picture shows wide columns."""
+    """Whether the strongest comb of wide columns in a picture stands out."""
     strips = _strips_of(plane)
-    return strips is not None and wide_grid(strips, sigma) is not None
+    combs = [] if strips is None else find_combs(strips, sigma)
+    if strips is None or not combs:
+        return False
+    some = strips.blocks(slice(None, None, 2))
+    grid = moved_by_waveforms(some, grid_of_comb(combs[0], strips), sigma, SETTINGS.first_steps)
+    return _stands_out(some, with_light(some, grid, sigma))
 
 
 def _score(grid: Grid) -> float:
@@ -194,27 +202,20 @@ def _score(grid: Grid) -> float:
     return grid.explained + SETTINGS.contrast_weight * grid.contrast
 
 
-def narrow_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid | None:
-    """The grid of narrow columns, or None.
-
-    The parts of the picture are searched, from the middle on. A clear grid is followed over the whole width. If
-    there is none, the rival is followed, from the middle on. Args: see `wide_grid`.
-    """
+def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
+    """The grid of narrow columns, or None: parts of the picture are searched, and a clear grid is followed outwards."""
     some, few = (strips.blocks(slice(None, None, step)) for step in (2, 4))
     for part in sorted(range(strips.n_parts), key=lambda part: abs(part - strips.n_parts // 2)):
         for comb in find_combs(strips.part(part), sigma)[:1]:
             own = few.part(part)
             grid = moved_by_waveforms(own, grid_of_comb(comb, strips.part(part)), sigma, SETTINGS.first_steps)
             is_block = abs(grid.pitch_px - _BLOCK_PX) < _BLOCK_TOLERANCE_PX
-            if is_block or not _stands_out(own, with_light(own, grid, sigma), SETTINGS.min_narrow_contrast):
+            if is_block or not _stands_out(own, with_light(own, grid, sigma)):
                 continue
             grid = with_light(some, _followed(some, grid, float(own.raw_x.mean()), sigma), sigma)
-            if _stands_out(some, grid, SETTINGS.min_narrow_contrast):
+            if _stands_out(some, grid):
                 return grid
-    if rival is None or with_light(few, rival, sigma).contrast <= 0:
-        return None
-    rival = with_light(some, _followed(some, rival, 0.0, sigma), sigma)
-    return rival if _stands_out(some, rival) else None
+    return None
 
 
 def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
@@ -224,14 +225,14 @@ def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
         reach *= SETTINGS.reach_gain
         within = np.abs(strips.raw_x - middle) < reach
         near = np.flatnonzero(within.any(axis=1))
-        grid = moved_by_waveforms(strips.blocks(near), grid, sigma, SETTINGS.first_steps, within[near])
+        grid = moved_by_waveforms(strips.blocks(near), grid, sigma, SETTINGS.last_steps, within[near])
     return grid
 
 
-def _stands_out(strips: Strips, grid: Grid, min_contrast: float = SETTINGS.min_contrast) -> bool:
+def _stands_out(strips: Strips, grid: Grid) -> bool:
     """Whether borders half a column further on explain less, by more than chance."""
     by_chance = grid.explained / np.sqrt(strips.picture_rows)
-    return bool(grid.contrast > min_contrast * by_chance)
+    return bool(grid.contrast > SETTINGS.min_contrast * by_chance)
 
 
 def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> list[OutlineCandidate]:

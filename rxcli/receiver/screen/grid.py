@@ -43,11 +43,6 @@ class Grid:
         return float(self.width / self.numbers[1])
 
     @property
-    def is_plain(self) -> bool:
-        """Whether the columns are beyond doubt, by the share of the light that their borders explain."""
-        return self.contrast > SETTINGS.plain_contrast * self.explained
-
-    @property
     def estimated_lens(self) -> Lens | None:
         """Lens with the estimated radial coefficient, or None if the lens is known."""
         if self.lens is not None:

@@ -18,7 +18,7 @@ from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_slop
 from rxcli.receiver.screen.rows import Plane
 from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import LONG_ROWS, Strips
-from rxcli.receiver.screen.waveforms import Mixes, offsets_of_known
+from rxcli.receiver.screen.waveforms import Mixes, offsets
 from rxcli.types import Clock, Float32Array, FloatArray, Lens
 
 #: Changes of light below which waves are set to zero: products of smaller numbers take many times the time.
@@ -60,7 +60,8 @@ def corners_by_slots(
         mixes = Mixes.of(columns_at(numbers, strips.x, strips.y), sigma, n_columns)
         columns = np.clip(mixes.first_column.astype(np.int64) + np.arange(mixes.share.shape[2]), 0, n_columns - 1)
         windows = np.tile(np.arange(strips.n_windows), strips.n_parts)
-        off, weight = offsets_of_known(strips, mixes, waves[windows[:, None], columns])
+        known = waves[windows[:, None], columns]
+        off, weight = offsets(known, strips.changes, mixes.share, mixes.slopes(), strips.n_rows)
         normal = (slopes * weight.ravel()) @ slopes.T + np.diag(prior)
         gradient = slopes @ (weight * off).ravel() - prior * (numbers - start.numbers)
         numbers = numbers + np.linalg.solve(normal, gradient)

@@ -63,8 +63,6 @@ class FinderSettings:
     ridge: float = 0.5
     #: Gain of a fit's steps: they are too short because the waveforms were estimated with the same grid.
     step_gain: float = 2.5
-    #: Standard deviations beyond which the weight of a strip's offset decreases.
-    huber_sd: float = 1.0
     #: Prior standard deviations of perspective and of radial distortion.
     perspective_sd: float = 0.15
     radial_sd: float = 0.004
@@ -75,9 +73,8 @@ class FinderSettings:
     last_steps: int = 2
     #: Factor by which the followed width of a grid of narrow columns grows at a time.
     reach_gain: float = 1.4
-    #: Minimum contrast, as a share of the explained light times the root of the number of rows; that of narrow columns.
+    #: Minimum contrast, as a share of the explained light times the root of the number of rows.
     min_contrast: float = 0.95
-    min_narrow_contrast: float = 1.5
     #: Focal length of a camera that no profile describes, picture widths.
     focal_widths: float = 0.8
     #: Gauss-Newton steps with decided slots, and prior standard deviations of the finder's columns: shift and widths in

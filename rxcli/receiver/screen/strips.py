@@ -9,7 +9,7 @@ fifth of the picture's width has finer strips and its own blocks; everything aft
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 _Real = TypeVar("_Real", np.float32, np.float64)
 #: Averaged rows whose mean the band pass takes off.
 LONG_ROWS = 8
+#: Share of a strip's power that may be due to rounding.
+_ROUNDING = 1e-6
 #: Arrays by block and strip.
 _OF_STRIPS = ("changes", "lit", "level", "darkest", "raw_x", "raw_y", "x", "y")
 
@@ -79,19 +81,21 @@ class Strips:
         pairs = np.einsum("bsr,bsr->bs", self.changes[:, :-distance], self.changes[:, distance:])
         return np.asarray(pairs / np.float32(self.changes.shape[2]), np.float32)
 
-    def blocks(self, chosen: slice | NDArray[np.int64]) -> Strips:
-        """Some of the blocks."""
-        arrays = {name: getattr(self, name)[chosen] for name in _OF_STRIPS}
-        return replace(self, **arrays)
+    def without_common_light(self) -> Strips:
+        """The same without the light that all columns share, as of headers and lamps: it shows no borders."""
+        changes = _without(self.changes, np.einsum("bsr,bs->br", self.changes, self.lit))
+        left = _power(changes)
+        changes /= np.sqrt(left + np.float32(_ROUNDING))[..., None]
+        lit = _lit(changes) * left
+        return replace(self, changes=changes, lit=lit, n_rows=_independent_rows(changes, lit))
+
+    def blocks(self, chosen: Any) -> Strips:
+        """Some of the blocks, or of their strips, by an index of the first axis or of the first two."""
+        return replace(self, **{name: getattr(self, name)[chosen] for name in _OF_STRIPS})
 
     def part(self, number: int) -> Strips:
         """The blocks of one part of the width."""
         return self.blocks(slice(number * self.n_windows, (number + 1) * self.n_windows))
-
-    def between(self, start: int, end: int) -> Strips:
-        """The strips from `start` on, up to but without `end`, of every block."""
-        arrays = {name: getattr(self, name)[:, start:end] for name in _OF_STRIPS}
-        return replace(self, **arrays)
 
     def sides_of_gap(self) -> list[Strips]:
         """The strips on either side of the widest gap without coherent light, the gap in both; none without a gap."""
@@ -103,7 +107,7 @@ class Strips:
         start, end = max(edges.tolist(), key=lambda gap: gap[1] - gap[0], default=(0, 0))
         if (end - start) * self.step < SETTINGS.min_gap_widths or lit.mean() < SETTINGS.min_apart_light:
             return []
-        return [self.between(0, end), self.between(start, lit.size)]
+        return [self.blocks(np.s_[:, :end]), self.blocks(np.s_[:, start:])]
 
 
 def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1) -> Strips:
@@ -222,8 +226,7 @@ def _short_rows(light: Float32Array) -> int:
 def _windows(band: Float32Array, n_windows: int) -> Float32Array:
     """(W, S, R) windows of rows, each strip scaled to a mean square of one."""
     changes = np.ascontiguousarray(band.reshape(len(band), n_windows, -1).swapaxes(0, 1))
-    power = np.einsum("wsr,wsr->ws", changes, changes) / np.float32(changes.shape[2])
-    changes /= (np.sqrt(power) + np.float32(TINY))[..., None]
+    changes /= (np.sqrt(_power(changes)) + np.float32(TINY))[..., None]
     return changes
 
 
@@ -232,10 +235,25 @@ def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Arra
     n_dark = max(int(SETTINGS.dark_share * changes.shape[1]), 1)
     dark = np.argsort(_smooth(_neighbours(changes), 5, 1), axis=1)[:, :n_dark]
     noise = np.take_along_axis(changes, dark[..., None], axis=1).mean(axis=1)
-    power = np.einsum("wr,wr->w", noise, noise) + np.float32(TINY)
-    share = np.matmul(changes, noise[..., None]) / power[:, None, None]
-    quiet = np.asarray(changes - share * noise[:, None], np.float32)
-    return quiet, np.clip(_smooth(_neighbours(quiet), 3, 3), 0, 1), noise
+    quiet = _without(changes, noise)
+    return quiet, _lit(quiet), noise
+
+
+def _without(changes: Float32Array, part: Float32Array) -> Float32Array:
+    """Project (B, R) off the strips (B, S, R) of each block: the columns change, but not their mixes in the strips."""
+    power = np.einsum("br,br->b", part, part) + np.float32(TINY)
+    share = np.matmul(changes, part[..., None]) / power[:, None, None]
+    return np.asarray(changes - share * part[:, None], np.float32)
+
+
+def _power(changes: Float32Array) -> Float32Array:
+    """(B, S) mean square of strips along the rows."""
+    return np.asarray(np.einsum("bsr,bsr->bs", changes, changes) / np.float32(changes.shape[2]), np.float32)
+
+
+def _lit(changes: Float32Array) -> Float32Array:
+    """(B, S) coherence of each strip's neighbours, 0..1."""
+    return np.asarray(np.clip(_smooth(_neighbours(changes), 3, 3), 0, 1), np.float32)
 
 
 def _neighbours(changes: Float32Array) -> Float32Array:

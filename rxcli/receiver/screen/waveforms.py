@@ -7,6 +7,7 @@ light of the strips that it explains, and the loss if its borders lie half a col
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,13 +65,15 @@ def _dot(left: Float32Array, right: Float32Array) -> Float32Array:
     return np.asarray(np.einsum("bsk,bsk->bs", left, right), np.float32)
 
 
-def _waveforms(strips: Strips, mixes: Mixes, known: int) -> Float32Array:
-    """(B, K, R) waveforms of the columns from the even strips (0) or the odd ones (1)."""
-    weight = np.sqrt(strips.lit[:, known::2])[..., None]
-    weighted = mixes.share[:, known::2] * weight
+def _halves(strips: Strips, mixes: Mixes) -> Iterator[tuple[slice, Float32Array]]:
+    """The odd strips, with the waveforms (B, K, R) of the columns estimated from the even ones; and vice versa."""
+    weighted = mixes.share * np.sqrt(strips.lit)[..., None]
     turned = weighted.transpose(0, 2, 1)
-    normal = np.matmul(turned, weighted) + np.float32(SETTINGS.ridge) * np.eye(weighted.shape[2], dtype=np.float32)
-    return np.asarray(np.matmul(np.linalg.inv(normal), np.matmul(turned, strips.changes[:, known::2])), np.float32)
+    # Neighbouring strips have nearly the same mix, so half the normal matrix serves either half of them.
+    normal = np.matmul(turned, weighted) / 2 + np.float32(SETTINGS.ridge) * np.eye(len(turned[0]), dtype=np.float32)
+    inverse = np.linalg.inv(normal)
+    for known, others in ((slice(0, None, 2), slice(1, None, 2)), (slice(1, None, 2), slice(0, None, 2))):
+        yield others, np.matmul(inverse, np.matmul(turned[..., known], strips.changes[:, known]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,20 +98,16 @@ class _Predicted:
 def predicted_light(strips: Strips, u: FloatArray, sigma: float) -> Float32Array:
     """(B, S, R) products of each strip's changes with their prediction by the other half, at columns (B, S)."""
     out, mixes = np.empty_like(strips.changes), Mixes.of(u, sigma)
-    for known, asked in ((0, 1), (1, 0)):
-        waves = _waveforms(strips, mixes, known)
-        np.multiply(np.matmul(mixes.share[:, asked::2], waves), strips.changes[:, asked::2], out=out[:, asked::2])
+    for half, waves in _halves(strips, mixes):
+        np.multiply(np.matmul(mixes.share[:, half], waves), strips.changes[:, half], out=out[:, half])
     return out
 
 
 def explained_light(strips: Strips, u: FloatArray, sigma: float) -> float:
     """Log-likelihood gain of strips at columns (B, S) from their prediction by the other half of the strips."""
     total, mixes = 0.0, Mixes.of(u, sigma)
-    for known, asked in ((0, 1), (1, 0)):
-        predicted, own = (
-            _Predicted.of(_waveforms(strips, mixes, known), strips.changes[:, asked::2]),
-            mixes.share[:, asked::2],
-        )
+    for half, waves in _halves(strips, mixes):
+        predicted, own = _Predicted.of(waves, strips.changes[:, half]), mixes.share[:, half]
         power = _dot(np.matmul(own, predicted.waves), own) * predicted.power + _TINY
         similarity = np.maximum(_dot(own, predicted.strips), 0) ** 2 / power
         total -= 0.5 * strips.n_rows * float(np.log1p(-np.minimum(similarity, np.float32(0.999))).sum())
@@ -154,33 +153,26 @@ def moved_by_waveforms(
 
 def _offsets(strips: Strips, mixes: Mixes) -> tuple[FloatArray, FloatArray]:
     """(B, S) offset of each strip from its position in a grid, columns, and the precision of the offset."""
-    off, precision = np.zeros(strips.x.shape), np.zeros(strips.x.shape)
-    slope, n = mixes.slopes(), strips.changes.shape[2]
-    for known, asked in ((0, 1), (1, 0)):
-        predicted = _Predicted.of(_waveforms(strips, mixes, known), strips.changes[:, asked::2])
-        found = _offsets_of(predicted, mixes.share[:, asked::2], slope[:, asked::2], n)
-        off[:, asked::2], precision[:, asked::2] = found
-    return off, _robust(off, precision * strips.n_rows / n)
+    off, precision, slope = np.zeros(strips.x.shape), np.zeros(strips.x.shape), mixes.slopes()
+    for half, waves in _halves(strips, mixes):
+        found = offsets(waves, strips.changes[:, half], mixes.share[:, half], slope[:, half], strips.n_rows)
+        off[:, half], precision[:, half] = found
+    return off, precision
 
 
-def offsets_of_known(strips: Strips, mixes: Mixes, waves: Float32Array) -> tuple[FloatArray, FloatArray]:
-    """(B, S) offset of each strip from its position in a grid, by known waveforms (B, K, R), and its precision."""
-    n = strips.changes.shape[2]
-    predicted = _Predicted.of(waves, strips.changes)
-    off, precision = _offsets_of(predicted, mixes.share, mixes.slopes(), n)
-    return np.asarray(off, np.float64), _robust(off, np.asarray(precision * strips.n_rows / n, np.float64))
-
-
-def _robust(off: FloatArray | Float32Array, precision: FloatArray) -> FloatArray:
-    """Precision of offsets, reduced for outliers (Huber weights)."""
-    limit = SETTINGS.huber_sd / np.sqrt(np.maximum(precision, 1e-9))
-    return np.asarray(precision / np.maximum(np.abs(off) / limit, 1.0))
-
-
-def _offsets_of(
-    predicted: _Predicted, share: Float32Array, slope: Float32Array, n_rows: int
+def offsets(
+    waves: Float32Array, changes: Float32Array, share: Float32Array, slope: Float32Array, n_rows: float
 ) -> tuple[Float32Array, Float32Array]:
-    """Regress strips on their light and its slope along the screen: offset and its precision."""
+    """Regress strips on their light and its slope along the screen: (B, S) offset, columns, and its precision.
+
+    Args:
+        waves: (B, K, R) waveforms of the columns.
+        changes: (B, S, R) of the strips.
+        share: (B, S, K) of the columns in their light.
+        slope: (B, S, K) of the shares.
+        n_rows: independent rows of a block.
+    """
+    predicted = _Predicted.of(waves, changes)
     model = np.matmul(share, predicted.waves)
     power = _dot(model, share) + _TINY
     gain = _dot(predicted.strips, share) / power
@@ -189,4 +181,6 @@ def _offsets_of(
     projection = _dot(predicted.strips, slope) - shared * gain * power
     noise = np.maximum(predicted.power - gain * gain * power, 0) / np.float32(n_rows) + _TINY
     lit = np.maximum(gain, np.float32(0))
-    return projection / (np.maximum(lit, np.float32(0.05)) * slope_power), lit * lit * slope_power / noise
+    off, precision = projection / (np.maximum(lit, np.float32(0.05)) * slope_power), lit * lit * slope_power / noise
+    # Huber weights: offsets beyond one standard deviation count less.
+    return off, precision / np.maximum(np.abs(off) * np.sqrt(precision), 1)
