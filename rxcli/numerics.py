@@ -15,6 +15,8 @@ from rxcli.types import Float32Array, FloatArray
 
 #: Lower limit of divisors, far below any significant light, weight or variance.
 TINY = 1e-12
+#: Lower limit of likelihoods in single precision, so that their logarithm exists.
+MIN_FLOAT32 = np.finfo(np.float32).tiny
 #: Median of the absolute value of a normal variable of unit variance.
 NORMAL_MEDIAN = 0.6745
 #: Change of a header's slots, lit 1 and dark -1, at its borders.
@@ -81,3 +83,8 @@ def header_correlation(total: FloatArray, samples_per_slot: int) -> FloatArray:
     for slot in np.flatnonzero(_HEADER_STEPS):
         out -= _HEADER_STEPS[slot] * total[..., slot * samples_per_slot :][..., :n]
     return out / length
+
+
+def peak_offset(before: FloatArray, peak: FloatArray, after: FloatArray) -> FloatArray:
+    """Offset, in samples, of the top of the parabola through a peak and its neighbours; at most half a sample."""
+    return np.asarray(0.5 * (after - before) / np.maximum(2 * peak - before - after, TINY))

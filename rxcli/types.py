@@ -263,11 +263,6 @@ class BurstPosteriors:
         """Posteriors of some columns."""
         return BurstPosteriors(*(getattr(self, f.name)[_columns_of(f.name, columns)] for f in fields(self)))
 
-    def of_burst(self, index: int) -> BurstPosteriors:
-        """Posteriors of one burst."""
-        own = (f.name for f in fields(self) if f.name not in _BY_COLUMN)
-        return replace(self, **{name: getattr(self, name)[index : index + 1] for name in own})
-
     def with_columns(self, columns: IntArray, some: BurstPosteriors) -> BurstPosteriors:
         """Replace the posteriors of the named columns by `some`."""
 

@@ -29,7 +29,7 @@ class Acquisition:
     profiles: RowProfiles
     clock: Clock
     #: The screen, and screens that differ from it only in the number of copies; the copies decide.
-    variants: tuple[ScreenProfile, ...] = ()
+    variants: tuple[ScreenProfile, ...]
 
     @cached_property
     def binned(self) -> RowProfiles:
@@ -39,7 +39,7 @@ class Acquisition:
     @property
     def repeats(self) -> tuple[int, ...]:
         """Possible numbers of copies of a burst."""
-        return tuple(screen.repeats for screen in self.variants) or (self.screen.repeats,)
+        return tuple(screen.repeats for screen in self.variants)
 
     def variant(self, repeats: int) -> ScreenProfile:
         """The screen that sends a packet `repeats` times."""

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import CameraProfile, ReadoutMode, match_camera
+from rxcli.profiles import match_camera
 from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure
 from rxcli.receiver.screen import geometry
 from rxcli.types import Frame, Lens
 
 
-def _profile_of(frame: Frame, options: ReceiverOptions) -> CameraProfile | None:
-    meta = frame.metadata
-    if options.force_camera:
-        return options.cameras[0]
-    return match_camera(options.cameras, meta.make, meta.model, frame.width, frame.height)
-
-
 def known_camera(frame: Frame, options: ReceiverOptions) -> Camera | Failure | None:
     """Camera from the matching profile, or None."""
-    profile = _profile_of(frame, options)
+    meta = frame.metadata
+    profile = (
+        options.cameras[0]
+        if options.force_camera
+        else match_camera(options.cameras, meta.make, meta.model, frame.width, frame.height)
+    )
     if profile is None:
         return None
     mode = profile.mode_for(frame.width, frame.height)
@@ -30,15 +28,11 @@ def known_camera(frame: Frame, options: ReceiverOptions) -> Camera | Failure | N
         )
     lens = geometry.lens_for(profile.lens, frame.width, frame.height) if profile.lens else None
     tone = DEFAULT_TONE if profile.tone == "auto" else profile.tone
-    return Camera(profile.name, mode.line_delay_s, _exposure_of(frame, mode), lens, tone)
+    exposure_s = meta.exposure_s or mode.exposure_s or 5 * mode.line_delay_s
+    return Camera(profile.name, mode.line_delay_s, exposure_s, lens, tone)
 
 
 def known_lens(frame: Frame, options: ReceiverOptions) -> Lens | None:
     """Lens from the matching camera profile, or None."""
     known = known_camera(frame, options)
     return known.lens if isinstance(known, Camera) else None
-
-
-def _exposure_of(frame: Frame, mode: ReadoutMode) -> float:
-    exposure = frame.metadata.exposure_s or mode.exposure_s
-    return exposure if exposure else 5 * mode.line_delay_s

@@ -17,14 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import TINY
+from rxcli.numerics import MIN_FLOAT32, TINY
 from rxcli.protocol import HEADER, slot_patterns
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
+#: Points over which the mean of a sample or a strip is taken.
+_FINE = 32
 #: Slots of exposure that each further two slots of ISI memory cover.
 _MEMORY_SLOTS = 1.3
 #: Longest ISI memory of the trellis; five slots cover an exposure of four.
-MAX_MEMORY = 5
+_MAX_MEMORY = 5
 #: The dark slots in the middle of a header.
 _DARK_FROM = HEADER.index(0, HEADER.index(1))
 _DARK_TO = HEADER.index(1, _DARK_FROM)
@@ -99,20 +101,18 @@ class Exposure:
     taps: FloatArray
 
     @staticmethod
-    def of(exposure_slots: float, samples_per_slot: int, isi_memory: int | None = None) -> Exposure:
-        """Build the response of an exposure.
+    def of(exposure_slots: float, samples_per_slot: int) -> Exposure:
+        """Build the response of an exposure, with the shortest ISI memory that covers it.
 
         Args:
             exposure_slots: length of the exposure, slots.
             samples_per_slot: samples per slot, Q.
-            isi_memory: ISI memory; None for the shortest that covers the exposure.
         """
-        if isi_memory is None:
-            # Odd, so that metrics lie between samples; the slots at both ends are hardly exposed.
-            isi_memory = int(np.clip(2 * np.ceil(exposure_slots / _MEMORY_SLOTS) - 1, 1, MAX_MEMORY))
-        n_fine, q = 32, samples_per_slot
+        # Odd, so that metrics lie between samples; the slots at both ends are hardly exposed.
+        isi_memory = int(np.clip(2 * np.ceil(exposure_slots / _MEMORY_SLOTS) - 1, 1, _MAX_MEMORY))
+        q = samples_per_slot
         # A sample is a mean over its own length.
-        offsets = ((np.arange(n_fine) + 0.5) / n_fine - 0.5) / q
+        offsets = ((np.arange(_FINE) + 0.5) / _FINE - 0.5) / q
         centres = -isi_memory / 2 + (np.arange(q) + 0.5) / q
         fine = (centres[:, None] + offsets)[:, None, :]
         slots = np.arange(-isi_memory, 1)[:, None]
@@ -168,8 +168,7 @@ class Crosstalk:
 
         The shares of a strip add up to 1, because the picture contains any common factor.
         """
-        fine = 16
-        across = (np.arange(n_strips * fine) + 0.5) / (n_strips * fine) - 0.5
+        across = (np.arange(n_strips * _FINE) + 0.5) / (n_strips * _FINE) - 0.5
         distance = across[:, None] - np.arange(-1, 2)
         exponent = (-(distance**2) / (2 * max(light_spread, _MIN_WIDTH) ** 2)).reshape(n_strips, -1, 3)
         # A strip receives the mean over its width: a strip of a whole column has twice the crosstalk of its centre.
@@ -180,10 +179,6 @@ class Crosstalk:
     def own(self) -> Float32Array:
         """(1, S, 1) share of a column's own light in its strips."""
         return self.shares[None, :, 1, None].astype(np.float32)
-
-    def of_strips(self, strips: slice) -> Crosstalk:
-        """Crosstalk of some of the strips."""
-        return Crosstalk(self.shares[strips])
 
     def from_neighbours(
         self, light: Float32Array, columns: NDArray[np.int64], ahead: FloatArray | None = None
@@ -221,19 +216,14 @@ def _shifted(rows: Float32Array, by: FloatArray) -> Float32Array:
 
 
 class SlotLight:
-    """Light of slots (C, N), integrated between arbitrary instants.
-
-    Args:
-        slots: light of every slot, 0 dark to 1 lit, or the probability that it is lit.
-        beyond: light of the slots before and after; 0.5 if unknown.
-    """
+    """Light of slots (C, N), 0 dark to 1 lit, integrated between arbitrary instants; 0.5 before and after."""
 
     #: Number of slots before and after.
     _BEYOND = 8
 
-    def __init__(self, slots: Float32Array, beyond: float = 0.5) -> None:
+    def __init__(self, slots: Float32Array) -> None:
         n_columns, n = slots.shape
-        self._slots = np.full((n_columns, n + 2 * self._BEYOND + 1), beyond, np.float32)
+        self._slots = np.full((n_columns, n + 2 * self._BEYOND + 1), 0.5, np.float32)
         self._slots[:, self._BEYOND : self._BEYOND + n] = slots
         self._total = np.zeros_like(self._slots)
         np.cumsum(self._slots[:, :-1], axis=1, out=self._total[:, 1:])
@@ -293,8 +283,7 @@ def slot_llr(metrics: FloatArray, lit: Float32Array | None = None) -> Float32Arr
         odds = np.lib.stride_tricks.sliding_window_view(prior, isi_memory + 1, axis=-1)[..., ::-1]
         metrics = metrics + odds @ by_age.T
     likelihood = np.exp((metrics - metrics.max(axis=-1, keepdims=True)).astype(np.float32))
-    tiny = np.float32(1e-30)
-    gained = np.log(likelihood @ by_age + tiny) - np.log(likelihood @ (1 - by_age) + tiny) - odds
+    gained = np.log(likelihood @ by_age + MIN_FLOAT32) - np.log(likelihood @ (1 - by_age) + MIN_FLOAT32) - odds
     return np.asarray(sum(gained[..., age : age + n_slots, age] for age in range(isi_memory + 1)), np.float32)
 
 

@@ -19,11 +19,10 @@ from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.context import Failure, Outline, Timer
 from rxcli.receiver.corners import proposed_screens, too_small
 from rxcli.receiver.decode import assemble
-from rxcli.receiver.reception import Reception, headerless, slot_margin, soft_bits
+from rxcli.receiver.reception import Reception, headerless, soft_bits
 from rxcli.receiver.search import search
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
 from rxcli.receiver.sync import clock as sync
-from rxcli.receiver.unknown_camera import settle
 from rxcli.results.dump import dump_stages
 from rxcli.types import FloatArray, Frame, FrameResult
 
@@ -107,10 +106,10 @@ def _receive_screen(frame: Frame, outlines: list[Outline], options: ReceiverOpti
     if isinstance(found, Failure):
         return failed(result, found)
     outline, context, acquisition = found.outline, found.best.context, found.best.acquisition
+    camera = context.camera
     # Channel and decode, in turn: metrics of slots to symbols, and symbols to the picture.
     with timer("detect"):
         reception = decode_photograph(acquisition, options.skip, found.best.reception)
-    camera, _ = settle(context, acquisition, reception)
     tried = tuple(tried.step for tried in found.tried)
     result = replace(result, **outline.result_fields, **camera.result_fields, search=tried)
     with timer("detect"):
@@ -124,8 +123,8 @@ def _receive_screen(frame: Frame, outlines: list[Outline], options: ReceiverOpti
         reception.clock,
         reception.posteriors,
         reception.snr,
-        reception.samples,
-        slot_margin(reception),
+        reception.n_observed,
+        reception.confidence_features(reception.posteriors, denoised),
         no_header,
         options.min_confidence,
         denoised,

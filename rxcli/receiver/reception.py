@@ -15,7 +15,6 @@ from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.decode.soft_bits import assume_unobserved_certain, still_soft_bits
 from rxcli.receiver.decode.steady import is_steady
 from rxcli.receiver.settings import SETTINGS
-from rxcli.receiver.sync import clock as sync
 from rxcli.types import (
     BoolArray,
     BurstPosteriors,
@@ -36,6 +35,8 @@ class Reception:
     clock: Clock
     #: Samples of the initial pass: strips binned in pairs.
     samples: SlotSamples
+    #: Light of the columns between its local extremes, and its weight; see `sync.contrast`.
+    contrast: tuple[Float32Array, Float32Array]
     posteriors: BurstPosteriors
     #: (C, N): squared contrast over variance of every slot.
     snr: Float32Array
@@ -56,9 +57,14 @@ class Reception:
         return np.asarray(packets - detect.free_log_evidence(self.metrics, share))
 
     @cached_property
+    def n_observed(self) -> IntArray:
+        """(B, C, packet) number of copies in which each slot was observed."""
+        return assemble.slots_observed(self.samples, self.clock)
+
+    @cached_property
     def is_complete(self) -> BoolArray:
         """(B, C) packets with all payload slots observed."""
-        return assemble.complete(assemble.slots_observed(self.samples, self.clock))
+        return assemble.complete(self.n_observed)
 
     @property
     def payload_lit(self) -> Float32Array:
@@ -69,11 +75,19 @@ class Reception:
     @cached_property
     def packet_confidence(self) -> FloatArray:
         """(B, C) confidence of packets without the auto-encoder."""
-        by_burst = assemble.slot_margin_by_burst(slot_margin(self), self.clock)
+        return confidence.confidence(self.confidence_features(self.posteriors))
+
+    def confidence_features(self, posteriors: BurstPosteriors, denoised: frozenset[int] = frozenset()) -> FloatArray:
+        """(B, C, 8) features of the confidence of packets with these posteriors; some columns were denoised."""
         n_columns, n_strips = self.samples.light.shape[:2]
-        return confidence.confidence(
-            confidence.confidence_features(self.posteriors, by_burst, np.zeros(n_columns, bool), n_strips)
-        )
+        was_denoised = np.isin(np.arange(n_columns), list(denoised))
+        return confidence.confidence_features(posteriors, self._slot_margin, was_denoised, n_strips)
+
+    @cached_property
+    def _slot_margin(self) -> Float32Array:
+        """(B, C, N) log-likelihood ratio of each burst's payload slots as decided against their opposite."""
+        decided = self.clock.on_grid(self.posteriors.lit) > 0.5
+        return assemble.slot_margin_by_burst(detect.slot_margin(self.metrics, decided), self.clock)
 
     @property
     def scene(self) -> denoise.DenoiserInput | None:
@@ -86,6 +100,7 @@ class Reception:
             self,
             clock=replace(self.clock, delay_slots=self.clock.delay_slots[columns]),
             samples=self.samples.of_columns(columns),
+            contrast=(self.contrast[0][columns], self.contrast[1][columns]),
             posteriors=self.posteriors.of_columns(columns),
             snr=self.snr[columns],
             metrics=self.metrics[columns],
@@ -107,11 +122,6 @@ def packet_llr(reception: Reception) -> float:
     return float(np.logaddexp(reception.column_llr, 0.0).sum())
 
 
-def has_clear_packets(reception: Reception) -> bool:
-    """Whether the frame clearly contains packets."""
-    return packet_llr(reception) >= SETTINGS.clear_packets_llr
-
-
 def word_log_prob(reception: Reception) -> FloatArray:
     """(C,) log probability that all decided words of a column are right, by the light model."""
     return np.asarray(reception.posteriors.log_prob.sum(axis=(0, 2)))
@@ -126,21 +136,13 @@ def headerless(reception: Reception) -> NDArray[np.bool_]:
     out = assemble.find_headerless(reception.posteriors.header_llr)
     if not out.all() and shows_steady_light(reception):
         return np.ones_like(out)
-    if out.any():
-        out &= reception.column_llr < SETTINGS.min_headerless_llr
-    return out
-
-
-def contrast_of(reception: Reception) -> tuple[Float32Array, Float32Array]:
-    """(C, n) light of the columns between its local extremes, and its weight; see `sync.contrast`."""
-    samples = reception.samples
-    return sync.contrast(samples.light, samples.valid, samples.samples_per_slot, reception.model.noise.sigma)
+    return np.asarray(out & (reception.column_llr < SETTINGS.min_headerless_llr))
 
 
 def shows_steady_light(reception: Reception) -> bool:
     """Whether the light is that of a lamp or of a screen dimmed by switching."""
     lit = reception.clock.on_grid(reception.posteriors.lit)
-    return is_steady(*contrast_of(reception), lit, reception.clock.packet_slots)
+    return is_steady(*reception.contrast, lit, reception.clock.packet_slots)
 
 
 def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:
@@ -149,36 +151,17 @@ def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:
     return np.asarray((2 * n_lit < n_observed) | (n_observed == 0))
 
 
-def has_doubtful_packet(reception: Reception, certain: float) -> NDArray[np.bool_]:
-    """(C,) whether a complete packet has a confidence below `certain`."""
-    doubtful = (reception.packet_confidence < certain) & (
-        reception.posteriors.log_prob.min(axis=2) < SETTINGS.beyond_doubt_log_prob
-    )
-    return np.asarray((doubtful & reception.is_complete).any(axis=0))
-
-
 def best_log_prob(reception: Reception) -> FloatArray:
     """(C,) mean log probability of the symbols of each column's surest complete packet."""
     return np.asarray(np.where(reception.is_complete, reception.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0))
-
-
-def slot_margin(reception: Reception) -> Float32Array:
-    """(C, N) log-likelihood ratio of each slot as decided against its opposite."""
-    return detect.slot_margin(reception.metrics, reception.clock.on_grid(reception.posteriors.lit) > 0.5)
 
 
 def soft_bits(
     frame: Frame, reception: Reception, no_header: NDArray[np.bool_], denoised: frozenset[int] = frozenset()
 ) -> FrameSoftBits:
     """Soft bits of a photograph, including those of cut packets."""
-    n_observed = assemble.slots_observed(reception.samples, reception.clock)
-    n_columns, n_strips = reception.samples.light.shape[:2]
-    features = confidence.confidence_features(
-        assume_unobserved_certain(reception.posteriors, n_observed),
-        assemble.slot_margin_by_burst(slot_margin(reception), reception.clock),
-        np.isin(np.arange(n_columns), list(denoised)),
-        n_strips,
-    )
+    posteriors, n_observed = reception.posteriors, reception.n_observed
+    features = reception.confidence_features(assume_unobserved_certain(posteriors, n_observed), denoised)
     snr_db = assemble.snr_db_of_columns(reception.snr)
-    soft = still_soft_bits(reception.posteriors, n_observed, features, snr_db, no_header)
+    soft = still_soft_bits(posteriors, n_observed, features, snr_db, no_header)
     return replace(soft, source=frame.source, frame=frame.index, time_s=frame.time_s)

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 class WiringSettings:
     """Thresholds, each with its unit and its reason."""
 
-    #: Log-likelihood ratio of packets, all columns together, that is beyond doubt; wrong cameras reach 103.
-    clear_packets_llr: float = 200.0
     #: Log-likelihood ratio of headers and packets below which a picture contains no packets: without data it is below
     #: 10, with packets at least 74 in 120 hard pictures.
     min_packets_llr: float = 20.0
@@ -22,8 +20,6 @@ class WiringSettings:
     max_period_rows: int = 100
     switched_share: float = 0.7
 
-    #: Log probability of all symbols from which a column is certain without regard to single slots.
-    beyond_doubt_log_prob: float = -1e-3
     #: Log-likelihood below the best weight at which a weight is dropped.
     weight_margin: float = 20.0
     #: Lead of an assignment of copies to bursts, log-likelihood of their similarity, that is beyond doubt.
@@ -47,7 +43,7 @@ class StillSettings:
 
     #: Samples per slot of the first passes.
     coarse_samples: int = 2
-    #: Confidence below which a column with a symbol below `beyond_doubt_log_prob` gets further passes.
+    #: Confidence of a packet below which its column gets further passes.
     doubtful: float = 0.985
     #: Limit of strip slots for the network, which takes most of the time; the least certain columns are left out.
     max_network_slots: int = 100_000

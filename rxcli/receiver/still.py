@@ -21,7 +21,6 @@ from rxcli.receiver.reception import (
     Reception,
     best_log_prob,
     dark_columns,
-    has_doubtful_packet,
     packet_llr,
     word_log_prob,
 )
@@ -50,21 +49,21 @@ def _may_show_packets(initial: Reception) -> bool:
     return packet_llr(initial) + max(float(initial.posteriors.header_llr.sum()), 0.0) > SETTINGS.min_packets_llr
 
 
-def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception | None = None) -> Reception:
-    """Make an initial pass, and further passes over doubtful columns.
+def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception) -> Reception:
+    """Make further passes over doubtful columns.
 
     Each pass uses more of the light than the previous one and replaces its result.
 
     Args:
         acquisition: the clock and the row profiles.
         skip: enabled shortcuts, see `rxcli.options.SKIPS`.
-        initial: the initial pass; None to make it here.
+        initial: the initial pass.
     """
-    reception = initial or initial_pass(acquisition)
-    candidates = doubtful_columns(reception) if "certain_columns" in skip else np.arange(reception.snr.shape[0])
-    lit = candidates[~dark_columns(reception.snr)[candidates]] if "dark_columns" in skip else candidates
-    skipped = {"certain_columns": reception.snr.shape[0] - candidates.size, "dark_columns": candidates.size - lit.size}
-    for run_pass in (_of_all_strips, _without_row_noise, _without_row_noise):
+    reception, n_columns = initial, len(initial.snr)
+    candidates = doubtful_columns(initial) if "certain_columns" in skip else np.arange(n_columns)
+    lit = candidates[~dark_columns(initial.snr)[candidates]] if "dark_columns" in skip else candidates
+    skipped = {"certain_columns": n_columns - candidates.size, "dark_columns": candidates.size - lit.size}
+    for run_pass in (_of_all_strips, _without_row_noise):
         columns = np.intersect1d(lit, doubtful_columns(reception)) if "certain_columns" in skip else lit
         if columns.size:
             reception = run_pass(acquisition, reception, columns)
@@ -83,20 +82,13 @@ def initial_pass(acquisition: Acquisition) -> Reception:
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
     metrics = channel.initial_metrics(*contrast, model.exposure)
     clock = _in_bursts(acquisition, clock, metrics)
-    lit = clock.on_grid(_initial_slots(channel.by_burst(metrics, clock), model.exposure.isi_memory))
+    lit = clock.on_grid(_detect(metrics, clock, weight_margin=0.0).lit)
     columns = np.arange(samples.light.shape[0])
-    likelihoods = channel.slot_likelihoods(samples, clock, model, lit, columns, thorough=False)
+    likelihoods = channel.slot_likelihoods(samples, clock, model, lit, columns, is_initial=True)
     clock = _in_bursts(acquisition, clock, likelihoods.metrics)
     clock = sync.corrected(clock, likelihoods.timing)
     posteriors = _detect(likelihoods.metrics, clock)
-    return Reception(clock, samples, posteriors, likelihoods.snr, model, likelihoods.metrics)
-
-
-def _initial_slots(metrics: FloatArray, isi_memory: int) -> Float32Array:
-    """(B, C, packet) slots of bursts from initial metrics; longer exposures need the trellis."""
-    if isi_memory == 1:
-        return detect.initial_slot_probability(metrics)
-    return detect.detect(metrics, detect.plausible_weights(metrics, 0.0)).lit
+    return Reception(clock, samples, contrast, posteriors, likelihoods.snr, model, likelihoods.metrics)
 
 
 def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[Reception]:
@@ -116,28 +108,37 @@ def as_one_column(reception: Reception) -> Reception:
 
 def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
     """Columns with a complete packet of low confidence."""
-    return np.flatnonzero(has_doubtful_packet(reception, STILL.doubtful))
+    doubtful = (reception.packet_confidence < STILL.doubtful) & reception.is_complete
+    return np.flatnonzero(doubtful.any(axis=0))
 
 
 def _of_all_strips(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
-    """Receive some columns with all strips and all scales of the picture, and correct the clock."""
-    samples, model = _view(acquisition, reception, columns, STILL.coarse_samples)
+    """Receive some columns with all strips and all scales of the picture."""
+    return _received(reception, columns, *_view(acquisition, reception, columns, STILL.coarse_samples))
+
+
+def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
+    """Receive some columns on the fine grid after removal of row noise."""
+    samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), denoise.SAMPLES_PER_SLOT)
+    samples = denoise.remove_row_noise(reception.scene_of(samples, model)).samples
+    return _received(replace(reception, cleaned=(samples, model)), columns, samples.of_columns(columns), model)
+
+
+def _received(
+    reception: Reception, columns: NDArray[np.int64], samples: SlotSamples, model: channel.ObservationModel
+) -> Reception:
+    """Receive some columns from their samples, given the slots decided so far."""
     lit = reception.clock.on_grid(reception.posteriors.lit)
     likelihoods = channel.slot_likelihoods(samples, reception.clock, model, lit, columns)
-    timing = np.zeros((lit.shape[0], 2))
-    timing[columns] = likelihoods.timing
-    after = _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr)
-    return replace(after, clock=sync.corrected(after.clock, timing))
+    return _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr)
 
 
 def _with_metrics(
-    reception: Reception, columns: NDArray[np.int64], metrics: FloatArray, snr: Float32Array | None = None
+    reception: Reception, columns: NDArray[np.int64], metrics: FloatArray, snr: Float32Array
 ) -> Reception:
     """Replace the metrics of some columns and detect their words again."""
     of_all, snr_of_all = reception.metrics.copy(), reception.snr.copy()
-    of_all[columns] = metrics
-    if snr is not None:
-        snr_of_all[columns] = snr
+    of_all[columns], snr_of_all[columns] = metrics, snr
     posteriors = reception.posteriors.with_columns(columns, _detect(metrics, reception.clock))
     return replace(reception, metrics=of_all, snr=snr_of_all, posteriors=posteriors)
 
@@ -186,7 +187,7 @@ def apply_autoencoder(
     except ReceiverError as error:
         return reception, frozenset(), {**report, "columns": 0, "message": str(error)}
     corrected = reception.metrics[columns] + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
-    after = _with_metrics(reception, columns, corrected)
+    after = _with_metrics(reception, columns, corrected, reception.snr[columns])
     improved = columns[(word_log_prob(after) > word_log_prob(reception))[columns]]
     report.update(model=denoiser.name, kept=improved.size)
     metrics = reception.metrics.copy()
@@ -206,19 +207,6 @@ def _worth_showing(reception: Reception, columns: NDArray[np.int64]) -> NDArray[
     return np.sort(columns[np.argsort(-best_log_prob(reception)[columns], kind="stable")[:n_columns]])
 
 
-def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
-    """Receive some columns on the fine grid after removal of row noise, which a second pass finds removed."""
-    if reception.cleaned is None:
-        samples, model = _view(acquisition, reception, np.arange(reception.snr.shape[0]), denoise.SAMPLES_PER_SLOT)
-        scene = denoise.remove_row_noise(reception.scene_of(samples, model))
-        reception = replace(reception, cleaned=(scene.samples, model))
-    assert reception.cleaned is not None
-    samples, model = reception.cleaned
-    lit, asked = reception.clock.on_grid(reception.posteriors.lit), samples.of_columns(columns)
-    likelihoods = channel.slot_likelihoods(asked, reception.clock, model, lit, columns, timing=False)
-    return _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr)
-
-
 @lru_cache(maxsize=1)
 def _denoiser() -> denoise.Denoiser:
     return denoise.load_denoiser()
@@ -229,9 +217,9 @@ def _in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> C
     return sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)[0][0]
 
 
-def _detect(metrics: FloatArray, clock: Clock) -> BurstPosteriors:
+def _detect(metrics: FloatArray, clock: Clock, weight_margin: float = SETTINGS.weight_margin) -> BurstPosteriors:
     bursts = channel.by_burst(metrics, clock)
-    return detect.detect(bursts, detect.plausible_weights(bursts, SETTINGS.weight_margin))
+    return detect.detect(bursts, detect.plausible_weights(bursts, weight_margin))
 
 
 def _light_model(acquisition: Acquisition, clock: Clock, samples: SlotSamples) -> channel.ObservationModel:

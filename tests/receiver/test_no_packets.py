@@ -36,7 +36,8 @@ def _first(headers: float) -> Reception:
         header_llr=np.full((1, 3), headers / 3),
     )
     nothing = np.zeros((3, 261, 4))
-    return Reception(CLOCK, None, posteriors, np.zeros((3, 260), np.float32), None, nothing)  # type: ignore[arg-type]
+    snr = np.zeros((3, 260), np.float32)
+    return Reception(CLOCK, None, (snr, snr), posteriors, snr, None, nothing)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -55,7 +56,7 @@ def test_only_what_may_show_packets_is_looked_at_in_depth(
     looked: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    acquisition = Acquisition(None, None, CLOCK)  # type: ignore[arg-type]
+    acquisition = Acquisition(None, None, CLOCK, ())  # type: ignore[arg-type]
     monkeypatch.setattr(Reception, "is_complete", np.ones((1, 3), bool))
     monkeypatch.setattr(Reception, "packet_confidence", np.full((1, 3), confidence))
     seen: list[str] = []

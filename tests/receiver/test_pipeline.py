@@ -461,7 +461,8 @@ def test_packets_determine_the_bursts_where_the_similarity_of_copies_leaves_doub
 
 def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_not() -> None:
     options = options_for(clean())
-    reception = still.decode(found_in(clean(), options).best.acquisition, options.skip)
+    best = found_in(clean(), options).best
+    reception = still.decode(best.acquisition, options.skip, best.reception)
     assert not headerless(reception).any()
     unseen = replace(reception.posteriors, header_llr=np.full_like(reception.posteriors.header_llr, -30.0))
     assert not headerless(replace(reception, posteriors=unseen)).any()

@@ -116,7 +116,7 @@ def _simulated(simulated: SimulatedScene, seed: int) -> Sample | None:
     found = search(trial.frame, trial.options(), Timer())
     if isinstance(found, Failure):
         return None
-    reception = decode(found.best.acquisition, trial.options().skip)
+    reception = decode(found.best.acquisition, trial.options().skip, found.best.reception)
     scene, columns = reception.scene, doubtful_columns(reception)
     if scene is None or not columns.size:
         return None

@@ -54,6 +54,5 @@ def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
     level = level * weight
     product = summed(level[:-1] * level[1:]).sum(axis=0)
     power = np.sqrt(summed(level[:-1] ** 2).sum(axis=0) * summed(level[1:] ** 2).sum(axis=0))
-    lit = summed(weight).max(axis=0) > 0.2 * strips.rows.size / SETTINGS.likeness_bands
-    lit |= summed(strips.light).max(axis=0) > 0.02 * strips.rows.size / SETTINGS.likeness_bands
+    lit = summed(strips.light).max(axis=0) > 0.02 * strips.rows.size / SETTINGS.likeness_bands
     return np.asarray(product / np.maximum(power, TINY)), np.asarray(lit)

@@ -46,7 +46,12 @@ def settle(
         light_spread: sigma of the Gaussian that a column's light falls off with, column pitches.
         may_bend: whether the camera may have taken a distortion out, as it cannot from a mosaic.
     """
-    model = _Model(joined(strips, max(1, int(clock.rows_per_slot // 4))), lit, light_spread, clock.rows_per_slot)
+    model = _Model(
+        joined(strips, max(1, int(clock.rows_per_slot / SETTINGS.rows_per_width))),
+        lit,
+        light_spread,
+        clock.rows_per_slot,
+    )
     start = np.concatenate([[clock.row0, clock.rows_per_slot], _turned(hypothesis.curvature, hypothesis)])
     least = hypothesis.stated_exposure_slots
     exposure, exposure_sd = model.exposure(start, max(clock.exposure_slots, least))
@@ -54,9 +59,9 @@ def settle(
     values, covariance, near = model.fit(start, exposure, start.size if may_bend else 2)
     if may_bend and _chi_square(values[2:], covariance[2:, 2:]) < SETTINGS.bent_chi_square:
         values, covariance, near = model.fit(values * (np.arange(values.size) < 2), exposure, 2)
-    moved = float((np.abs(model.times(values) - model.times(start)) * model.strips.inside).max())
-    if near.explained < SETTINGS.min_explained or moved > SETTINGS.max_moved_slots:
+    if near.explained < SETTINGS.min_explained:
         return hypothesis, 0.0
+    moved = float((np.abs(model.times(values) - model.times(start)) * model.strips.inside).max())
     sd = np.sqrt(np.diag(covariance))
     found = replace(
         hypothesis,
@@ -104,7 +109,7 @@ class _Model:
         self.strips = strips
         self._slots = SlotLight(mixed)
         self._window = max(round(SETTINGS.picture_slots * rows_per_slot / strips.pitch), 1)
-        self._inside = local_mean(strips.inside, self._window) + np.float32(1e-3)
+        self._inside = np.maximum(local_mean(strips.inside, self._window), np.float32(1 / self._window))
         self._mean = self._local(strips.light)
         n = strips.rows.size
         #: Rows at the borders of blocks, and the bend terms (4, M, blocks + 1) there.

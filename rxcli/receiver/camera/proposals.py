@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.numerics import NORMAL_MEDIAN, TINY, folded, header_correlation, local_mean
+from rxcli.numerics import NORMAL_MEDIAN, TINY, folded, header_correlation, local_mean, peak_offset
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.curvature import likeliest_bend, straightened
@@ -59,12 +59,7 @@ def propose(
         screens: screens that it may show, at least one.
         exposure_s: exposure, None where the file does not state it.
         may_bend: whether the camera may have taken a distortion out, as it cannot from a mosaic.
-
-    Raises:
-        ValueError: no screens.
     """
-    if not screens:
-        raise ValueError("screens must name at least one screen (got none)")
     width = stripe_rows(strips)
     if width <= 0:
         return []
@@ -90,7 +85,7 @@ def stripe_rows(strips: Strips) -> float:
     """
     width = float(SETTINGS.first_width_rows)
     for _ in range(SETTINGS.width_rounds):
-        window = round(SETTINGS.scale_widths * width)
+        window = round(SETTINGS.level_widths * width)
         level, weight = levelled(strips.light, strips.inside, window, strips.noise)
         width = _half_width(_autocorrelation(columns_of(level * weight, strips.n_columns)))
         if width <= 0:
@@ -139,15 +134,15 @@ def _clocks(
     # The line: places are cycles over the picture, times _FINE.
     line = _slot_line(columns)
     low, high = (int(_FINE * n_rows / rows) for rows in (longest, shortest))
-    lines = _FINE * n_rows / (low + _peaks(line[low : high + 2], SETTINGS.n_lines, 2 * _FINE))
+    lines = _FINE * n_rows / (low + _peaks(line[low : high + 2], SETTINGS.n_peaks, 2 * _FINE))
     # Light exposed for about a slot has a stronger line at twice the rate.
-    twice, harmonics = 2 * lines, _FINE * np.array([1, 2])
+    harmonics = _FINE * np.array([1, 2])
     copies = _surprise(correlation, round(2 * SLOTS_PER_SYMBOL * shortest))
     total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
     for length, exposure in exposures.items():
         first, last = (int(rows * length) for rows in (shortest, longest))
-        lags = first + _peaks(copies[first : last + 1], SETTINGS.n_copies, max(round(2 * shortest), 1))
-        for rows in np.concatenate([lines, twice[twice < longest], lags / length]).tolist():
+        lags = first + _peaks(copies[first : last + 1], SETTINGS.n_peaks, max(round(2 * shortest), 1))
+        for rows in np.concatenate([lines, lags / length]).tolist():
             if rows * (length - PREAMBLE_SLOTS) > n_rows:
                 continue  # No payload is in view as a whole.
             common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
@@ -155,16 +150,13 @@ def _clocks(
                 float(np.interp(harmonics * n_rows / rows, np.arange(line.size), line).max()), SETTINGS.max_line
             )
             for is_reversed, header in enumerate(_header_peaks(total, rows, length)):
-                score = max(header, 0.0) ** 2 + common
-                if score < SETTINGS.min_score:
-                    continue
                 yield CameraHypothesis(
                     rows_per_slot=rows * pitch,
                     packet_slots=length,
                     reversed=bool(is_reversed),
                     curvature=bend,
                     exposure_slots=exposure or exposure_of(half_width / rows, rows * pitch),
-                    score=score,
+                    score=max(header, 0.0) ** 2 + common,
                     # A period that is off by a quarter of a slot over the picture shows as well.
                     rows_per_slot_sd=rows * rows * pitch / (4 * n_rows),
                     curvature_sd=np.abs(bend) / 4,
@@ -209,8 +201,7 @@ def _peaks(values: FloatArray, n: int, distance: int) -> FloatArray:
         if len(chosen) < n and all(abs(at - other) >= distance for other in chosen):
             chosen.append(at)
     at = np.array(chosen, np.int64)
-    before, here, after = values[at - 1], values[at], values[at + 1]
-    return np.asarray(at + 0.5 * (before - after) / (before - 2 * here + after))
+    return np.asarray(at + peak_offset(values[at - 1], values[at], values[at + 1]))
 
 
 def _header_peaks(total: FloatArray, rows_per_slot: float, packet_slots: int) -> tuple[float, float]:
@@ -226,7 +217,7 @@ def _header_peaks(total: FloatArray, rows_per_slot: float, packet_slots: int) ->
     response = header_correlation(np.interp(places, np.arange(total.size), total), _SAMPLES) / step
     if response.size == 0:
         return 0.0, 0.0
-    spread = float(np.median(np.abs(response))) / NORMAL_MEDIAN + 1e-6
+    spread = float(np.median(np.abs(response))) / NORMAL_MEDIAN + TINY
     period = packet_slots * _SAMPLES
     n_copies = folded(np.ones(response.size), period)
     score = folded(response, period) / np.sqrt(np.maximum(n_copies, 1)) / spread

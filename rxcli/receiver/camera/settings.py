@@ -13,14 +13,14 @@ class CameraSettings:
     strips_per_column: int = 2
     #: Variance of light that is nothing but rounding.
     min_variance: float = 1e-10
+    #: Limit of levelled light, standard deviations.
+    bounded_sigmas: float = 3.0
     #: Root mean square of levelled light that is nothing but rounding.
     min_soft_sign: float = 0.02
 
-    #: Half width of the columns' autocorrelation before anything is known, rows; rounds of estimating it; and the
-    #: window that light is levelled over meanwhile, in half widths.
+    #: Half width of the columns' autocorrelation before anything is known, rows; and rounds of estimating it.
     first_width_rows: int = 4
     width_rounds: int = 3
-    scale_widths: float = 10.0
     #: Window of the levels, in half widths of the columns' autocorrelation.
     level_widths: float = 16.0
     #: Rows that a half width keeps when rows are joined.
@@ -36,12 +36,10 @@ class CameraSettings:
 
     #: Largest bend that is tried: k1 for a focal length of one picture width.
     max_bend: float = 0.25
-    #: Peaks that are tried: of the slots' line, and of the columns' copies for every length of packet.
-    n_lines: int = 4
-    n_copies: int = 4
-    #: Maximum weight of the slots' line, log-likelihood, and minimum score of a hypothesis.
+    #: Peaks that are tried of the slots' line, and of the columns' copies for every length of packet.
+    n_peaks: int = 4
+    #: Maximum weight of the slots' line, log-likelihood.
     max_line: float = 30.0
-    min_score: float = 35.0
     #: Clocks this close, relative, are one; and hypotheses that are proposed.
     same_clock: float = 4e-3
     n_proposed: int = 5
@@ -60,9 +58,8 @@ class CameraSettings:
     exposure_factors: tuple[float, ...] = (0.75, 1.0, 1.33)
     #: Number of samples equivalent to an independent one, since errors within a slot and column are correlated.
     samples_per_independent: float = 10.0
-    #: A fit that explains less of the light's local variance, or moves any row by more slots, is none.
+    #: Least share of the light's local variance that a fit must explain.
     min_explained: float = 0.1
-    max_moved_slots: float = 20.0
     #: Ratio of errors to the scatter of the columns' contributions, since neighbours share their light.
     sd_scale: float = 1.6
     #: Chi-square of the four coefficients from which stripes are bent beyond doubt.

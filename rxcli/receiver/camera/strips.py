@@ -79,7 +79,7 @@ def joined(strips: Strips, n: int) -> Strips:
     return replace(
         strips,
         light=mean(strips.light).astype(np.float32),
-        inside=(mean(strips.inside) > 0.99).astype(np.float32),
+        inside=(mean(strips.inside) == 1).astype(np.float32),
         x=mean(strips.x),
         rows=mean(strips.rows),
         noise=strips.noise.of_mean(n),
@@ -94,12 +94,14 @@ def levelled(
 
     # Periods of a row or two leave no window; the smallest one is no use, but no error.
     size = (max(window, 1) | 1, 1)
-    share = cv2.blur(inside, size) + np.float32(1e-3)
+    share = np.maximum(cv2.blur(inside, size), np.float32(1 / size[0]))
     mean = cv2.blur(light, size) / share
     random = noise.variance(mean) + np.float32(SETTINGS.min_variance)
     signal = np.maximum(cv2.blur(light * light, size) / share - mean * mean - random, 0)
-    level = np.clip((light - mean) / np.sqrt(signal + 9 * random), -3, 3) * inside
-    return level, signal / (signal + 16 * random) * inside
+    sigmas = np.float32(SETTINGS.bounded_sigmas)
+    doubt = signal + sigmas * sigmas * random
+    level = np.clip((light - mean) / np.sqrt(doubt), -sigmas, sigmas) * inside
+    return level, signal / doubt * inside
 
 
 def columns_of(level: Float32Array, n_columns: int) -> Float32Array:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import re
 import tomllib
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
@@ -25,12 +26,12 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from rxcli.errors import ProfileError
-from rxcli.numerics import NORMAL_MEDIAN, box_sums
+from rxcli.numerics import NORMAL_MEDIAN, TINY, box_sums
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
-from rxcli.receiver.light import slot_llr
+from rxcli.receiver.light import Crosstalk, slot_llr
 from rxcli.resources import data_dir, onnx_runtime
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
@@ -82,11 +83,12 @@ class Denoiser(Protocol):
 def remove_row_noise(scene: DenoiserInput) -> DenoiserInput:
     """Remove row noise, the light that a sensor row has in common everywhere.
 
-    It is estimated for every column from the residuals of the other columns at the same instant.
+    It is estimated for every column from the residuals of the other columns at the same instant, and from every second
+    strip, since errors of the strips of a column are correlated.
     """
-    strips = slice(None, None, SETTINGS.row_strips)
+    strips = slice(None, None, 2)
     thin = replace(scene.samples, light=scene.samples.light[:, strips], valid=scene.samples.valid[:, strips])
-    model = replace(scene.model, crosstalk=scene.model.crosstalk.of_strips(strips))
+    model = replace(scene.model, crosstalk=Crosstalk(scene.model.crosstalk.shares[strips]))
     observed = _residuals(replace(scene, samples=thin, model=model), np.arange(len(scene.lit)))
     rows = _row_light(np.clip(observed.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS), observed.scale)[:, None]
     samples = replace(scene.samples, light=scene.samples.light - rows * scene.samples.valid)
@@ -145,17 +147,17 @@ def _row_light(residual: Float32Array, scale: Float32Array) -> Float32Array:
         scale: (C, S, n) one over the standard deviation.
     """
     total, weight = (residual * scale).sum(axis=1), (scale * scale).sum(axis=1)
-    weight = np.maximum(weight.sum(axis=0) - weight, np.float32(1e-6))
+    weight = np.maximum(weight.sum(axis=0) - weight, np.float32(TINY))
     mean = (total.sum(axis=0) - total) / weight
     # Errors of the strips of a column are correlated, which about doubles the variance of their mean.
     error = 2 / weight
     power = max(float(np.median(mean * mean)) / NORMAL_MEDIAN**2 - float(np.median(error)), 0.0)
-    return np.asarray(mean * np.float32(power) / (np.float32(power) + error + np.float32(1e-20)), np.float32)
+    return np.asarray(mean * np.float32(power) / (np.float32(power) + error), np.float32)
 
 
 def _strip_features(scene: DenoiserInput, observed: _Residuals, columns: NDArray[np.int64]) -> Float32Array:
     """(B, S, 26, N) features of strips, see `STRIP_FEATURES`."""
-    q, sigma = scene.samples.samples_per_slot, np.float32(max(scene.model.noise.sigma, 1e-7))
+    q, sigma = scene.samples.samples_per_slot, np.float32(max(scene.model.noise.sigma, TINY))
     valid, light, expected = scene.samples.valid[columns], observed.light, observed.expected
     level = _local_level(light, valid, q)
     base = np.float32(0.02) * level + 2 * sigma
@@ -281,12 +283,11 @@ class ModelCard(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     figures: dict[str, Any] = {}
 
 
-def load_denoiser(name_or_path: str = DEFAULT_MODEL, threads: int = 1) -> OnnxDenoiser:
+def load_denoiser(name_or_path: str = DEFAULT_MODEL) -> OnnxDenoiser:
     """Load a shipped model by name, or a model folder by path; the session starts when it is first used.
 
     Args:
         name_or_path: name of a folder in `models`, or path of a model folder.
-        threads: threads of the network.
 
     Raises:
         ProfileError: the model is missing, malformed, truncated, or made for another contract.
@@ -295,7 +296,7 @@ def load_denoiser(name_or_path: str = DEFAULT_MODEL, threads: int = 1) -> OnnxDe
     is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name_or_path) is not None
     folder = shipped if is_name and shipped.is_dir() else Path(name_or_path)
     card = _read_card(folder / "model.toml")
-    return OnnxDenoiser(card, _read_weights(folder / card.file, card), threads)
+    return OnnxDenoiser(card, _read_weights(folder / card.file, card))
 
 
 def _read_card(path: Path) -> ModelCard:
@@ -326,14 +327,12 @@ def _read_weights(path: Path, card: ModelCard) -> bytes:
     return data
 
 
+@dataclass(frozen=True, slots=True)
 class OnnxDenoiser:
     """A network in ONNX Runtime, called once per frame."""
 
-    def __init__(self, card: ModelCard, weights: bytes, threads: int = 1) -> None:
-        self.card = card
-        self._weights = weights
-        self._threads = threads
-        self._session: Any = None
+    card: ModelCard
+    weights: bytes
 
     @property
     def name(self) -> str:
@@ -349,26 +348,20 @@ class OnnxDenoiser:
             ProfileError: the file is not the network described by its card.
         """
         strips, features = network_inputs(scene, columns)
-        contract, onnxruntime = self.card.contract, onnx_runtime()
-        fed = {contract.strips: strips, contract.columns: features}
+        contract = self.card.contract
         try:
-            if self._session is None:
-                self._session = onnxruntime.InferenceSession(
-                    self._weights, self._options(onnxruntime), providers=["CPUExecutionProvider"]
-                )
-            (correction,) = self._session.run([contract.correction], fed)
+            fed = {contract.strips: strips, contract.columns: features}
+            (correction,) = _session(self.weights).run([contract.correction], fed)
         except Exception as error:
             reason = str(error).splitlines()[0]
             raise ProfileError(f"model {self.name}: ONNX Runtime refuses it ({reason})", "export it again") from None
         return np.asarray(correction, np.float32) * payload_observed(scene)[columns]
 
-    def _options(self, onnxruntime: Any) -> Any:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = self._threads
-        options.inter_op_num_threads = 1
-        options.log_severity_level = 3
-        return options
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Sessions do not travel to worker processes."""
-        return {"card": self.card, "_weights": self._weights, "_threads": self._threads, "_session": None}
+@lru_cache(maxsize=1)
+def _session(weights: bytes) -> Any:
+    onnxruntime = onnx_runtime()
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(weights, options, providers=["CPUExecutionProvider"])

@@ -65,11 +65,6 @@ class Expected:
         """(C, S, n) light of all columns."""
         return self.neighbours + self.own * self.shape
 
-    def of(self, columns: NDArray[np.int64]) -> Expected:
-        """Predicted light of some of the columns."""
-        slope = None if self.slope is None else self.slope[columns]
-        return Expected(self.neighbours[columns], self.own, self.shape[columns], slope)
-
 
 def estimate_black_level(samples: SlotSamples, clock: Clock) -> float:
     """Estimate the light of a dark slot: the median over the three dark slots in the middle of headers."""

@@ -12,10 +12,6 @@ from rxcli.protocol import slot_patterns
 from rxcli.receiver.light import Exposure
 from rxcli.types import Clock, Float32Array, FloatArray
 
-#: Chebyshev nodes, light levels between dark and lit, from which the likelihoods of other levels are interpolated. Used
-#: when patterns have more levels than nodes, i.e. for exposures of more than two slots.
-_NODES = 0.5 - 0.5 * np.cos(np.pi * np.arange(8) / 7)
-
 
 def initial_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposure) -> FloatArray:
     """Initial metrics (C, N + memory, patterns), from contrast alone.
@@ -29,10 +25,9 @@ def initial_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposu
     # of full contrast.
     q = exposure.samples_per_slot
     precision = np.minimum(weight / 3, 1) * np.float32(2 / q)
-    value = np.clip(pooled, -1.5, 1.5)
 
     def of_level(place: int, level: float) -> Float32Array:
-        return np.asarray(-np.square(value[:, place::q] - np.float32(2 * level - 1)) * precision[:, place::q])
+        return np.asarray(-np.square(pooled[:, place::q] - np.float32(2 * level - 1)) * precision[:, place::q])
 
     return by_pattern(exposure, of_level)
 
@@ -62,7 +57,7 @@ class _LevelPlan:
     places: list[int]
     levels: list[float]
     metrics: list[int]
-    #: (K, patterns) weight of each level in a pattern.
+    #: (K, patterns) 1 where a pattern has the level.
     shares: Float32Array
 
 
@@ -78,22 +73,11 @@ def _level_plan(taps: bytes, samples_per_slot: int) -> _LevelPlan:
         metric, sample = divmod(place + lead, q)
         # Many patterns have the same level in a sample, which is evaluated once.
         levels, number = np.unique((slot_patterns(isi_memory) @ weights[sample]).round(9), return_inverse=True)
-        if levels.size <= _NODES.size:
-            share = np.eye(levels.size)[number]
-        else:
-            levels, share = _NODES, _interpolated(levels)[number]
         places += [place] * levels.size
         metrics += [metric] * levels.size
         evaluated += levels.tolist()
-        shares.append(share.T)
+        shares.append(np.eye(levels.size)[number].T)
     return _LevelPlan(places, evaluated, metrics, np.concatenate(shares).astype(np.float32))
-
-
-def _interpolated(levels: FloatArray) -> FloatArray:
-    """(levels, nodes) Lagrange weights of the nodes at the levels."""
-    off_diagonal = ~np.eye(_NODES.size, dtype=bool)
-    ratios = (levels[:, None, None] - _NODES) / np.where(off_diagonal, _NODES[:, None] - _NODES, 1)
-    return np.asarray(np.where(off_diagonal, ratios, 1).prod(axis=2))
 
 
 def metrics_of(llr: Float32Array, isi_memory: int) -> FloatArray:

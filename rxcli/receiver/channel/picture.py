@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.numerics import box_sums
+from rxcli.numerics import TINY, box_sums
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Float32Array
 
-#: Lower limit of a power, for samples without light.
-_TINY = np.float32(1e-9)
+#: Squared prediction that is added to a sum of them, for samples without light.
+_MIN_POWER = np.float32(1e-4)
 #: Predictions of the picture per slot: exposures that overlap a sample's own cannot contradict it.
 PER_SLOT = 2
 
@@ -87,10 +87,11 @@ def predict_picture(sums: PictureSums, noise_floor: float, scales: tuple[int, ..
     for scale in scales:
         light, observed = _sides(around, PER_SLOT * scale, sums.cross.shape[-1], one_sided)
         picture = np.maximum(light, 0, out=light)
-        picture /= observed + np.float32(1e-4)
+        observed += _MIN_POWER
+        picture /= observed
         # The scale is chosen once per slot.
         variance = np.square(picture[:, 1]) * texture.of(picture)
-        variance += dark_variance / (observed[:, 1] + np.float32(1e-6))
+        variance += dark_variance / observed[:, 1]
         if best is None:
             best = Prediction(picture, variance)
             continue
@@ -136,7 +137,7 @@ class _Texture:
         self._light = sums.light.sum(axis=0)
         self._twice = 2 * sums.cross
         #: Contribution of noise to the error.
-        self._noise = dark_variance * _around(sums.count.sum(axis=0)) + _TINY
+        self._noise = dark_variance * _around(sums.count.sum(axis=0)) + np.float32(TINY)
 
     def of(self, picture: Float32Array) -> Float32Array:
         """(sides, C, S, N) relative variance of `picture` (sides, 2, C, S, N)."""

@@ -21,8 +21,5 @@ class ChannelSettings:
     #: Minimum relative variance of a prediction, which covers the uncertainty of the crosstalk.
     min_texture: float = 0.002
 
-    #: Row noise is estimated from every n-th strip, since errors of the strips of a column are correlated.
-    row_strips: int = 2
-
 
 SETTINGS = ChannelSettings()

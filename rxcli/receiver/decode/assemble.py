@@ -9,7 +9,7 @@ import numpy as np
 
 from rxcli.numerics import TINY
 from rxcli.protocol import PREAMBLE_SLOTS, bits_per_symbol, indices_to_bits
-from rxcli.receiver.decode.confidence import BurstInClip, Quality, clip_quality, confidence_features, still_quality
+from rxcli.receiver.decode.confidence import BurstInClip, Quality, clip_quality, still_quality
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import (
     BELIEVABLE,
@@ -38,8 +38,8 @@ def column_results(
     clock: Clock,
     posteriors: BurstPosteriors,
     snr: Float32Array,
-    samples: SlotSamples,
-    slot_margin: Float32Array,
+    n_observed: IntArray,
+    confidence_features: FloatArray,
     headerless: BoolArray,
     min_confidence: float,
     denoised: frozenset[int] = frozenset(),
@@ -51,27 +51,24 @@ def column_results(
         clock: the clock.
         posteriors: of B bursts and C columns.
         snr: (C, N) squared contrast over variance of every slot of the grid.
-        samples: the samples, for what was visible.
-        slot_margin: (C, N) see `detect.slot_margin`.
+        n_observed: (B, C, packet) see `slots_observed`.
+        confidence_features: (B, C, 8) of the packets.
         headerless: (C,) columns without packets, see `find_headerless`.
         min_confidence: packets below it are left out.
         denoised: columns that were corrected by the auto-encoder.
         certainty: probability that the columns' numbers are right.
     """
-    snr_db = snr_db_of_columns(snr)
-    was_denoised = np.isin(np.arange(len(snr)), list(denoised))
-    by_burst = slot_margin_by_burst(slot_margin, clock)
-    quality = still_quality(posteriors, confidence_features(posteriors, by_burst, was_denoised, samples.light.shape[1]))
+    snr_db, quality = snr_db_of_columns(snr), still_quality(posteriors, confidence_features)
     bursts = [
-        _burst(clock, index, posteriors, index, quality, n_observed, snr_db, certainty)
-        for index, n_observed in enumerate(slots_observed(samples, clock))
+        _burst(clock, index, posteriors, index, quality, n_observed_of_burst, snr_db, certainty)
+        for index, n_observed_of_burst in enumerate(n_observed)
     ]
     sure = quality.confidence >= SETTINGS.min_best_confidence
     if not any((burst.possible & ~headerless)[sure[index]].any() for index, burst in enumerate(bursts)):
         # Light without data: an isolated packet is chance.
         bursts = [replace(burst, possible=np.zeros_like(burst.possible)) for burst in bursts]
     columns = _columns(clock, bursts, snr_db, headerless, np.zeros_like(headerless), min_confidence)
-    return tuple(replace(column, denoised=bool(was_denoised[column.column])) for column in columns)
+    return tuple(replace(column, denoised=column.column in denoised) for column in columns)
 
 
 def clip_results(
@@ -278,11 +275,7 @@ def why_no_packet(columns: tuple[ColumnResult, ...]) -> str:
 
 def frame_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
     """`ok` when every lit column gave a packet, `partial` when some did, `no_signal` when none did."""
-    lit = [column for column in columns if column.status != "dark"]
-    with_packet = [column for column in columns if column.packets]
-    if not with_packet:
-        return "no_signal"
-    return "ok" if all(column.packets for column in lit) else "partial"
+    return clip_status(columns) if any(column.packets for column in columns) else "no_signal"
 
 
 def slots_observed(samples: SlotSamples, clock: Clock) -> IntArray:

@@ -12,6 +12,7 @@ from functools import lru_cache
 import msgspec
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.resources import data_dir
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, IntArray
@@ -20,8 +21,8 @@ from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, In
 _MIN_CONTRADICTION = 0.5
 #: Tolerance when features are compared.
 _FEATURE_TOLERANCE = 1e-4
-#: Limits of the negative log probability of a packet, so that its log-odds are finite.
-_MIN_DOUBT, _MAX_DOUBT = 1e-9, 500.0
+#: Upper limit of the negative log probability of a packet, so that its log-odds are finite.
+_MAX_DOUBT = 500.0
 
 
 class _Photographs(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -189,7 +190,7 @@ def confidence_log_odds(confidence_features: FloatArray) -> FloatArray:
 
 
 def _log_odds(log_prob: FloatArray) -> FloatArray:
-    at_most = np.clip(log_prob, -_MAX_DOUBT, -_MIN_DOUBT)
+    at_most = np.clip(log_prob, -_MAX_DOUBT, -TINY)
     return np.asarray(at_most - np.log(-np.expm1(at_most)))
 
 

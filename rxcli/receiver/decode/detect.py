@@ -16,6 +16,7 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import MIN_FLOAT32
 from rxcli.protocol import (
     HEADER,
     PREAMBLE_SLOTS,
@@ -26,16 +27,13 @@ from rxcli.protocol import (
     dimming_symbol,
 )
 from rxcli.receiver.decode.settings import SETTINGS
-from rxcli.receiver.light import MAX_MEMORY, slot_llr
+from rxcli.receiver.light import slot_llr
 from rxcli.types import BurstPosteriors, Float32Array, FloatArray
 
-#: Lower limit of likelihoods, so that their logarithm exists: of states and slots relative to the likeliest one, and,
-#: within the range of float32, of words and bits.
-_MIN_LIKELIHOOD, _MIN_WORD = 1e-60, 1e-37
+#: Lower limit of likelihoods of states and slots relative to the likeliest one, so that their logarithm exists.
+_MIN_LIKELIHOOD = 1e-60
 #: Slots between rescalings of likelihoods.
 _SCALED_AFTER = 4
-#: Metrics per batch: more exceed the processor's cache, fewer take more calls.
-_AT_ONCE = 250_000
 
 
 def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> BurstPosteriors:
@@ -46,14 +44,7 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
             log-likelihood of the light at slot i given pattern j of `protocol.slot_patterns`. The first `isi_memory`
             slots are not used; the last `isi_memory` are the first slots of the header that follows.
         candidates: (C, 9) weights to consider, all by default.
-
-    Returns:
-        Posteriors; see `BurstPosteriors`.
-
-    Raises:
-        ValueError: shapes do not fit.
     """
-    _check(metrics)
     n_bursts, n_columns, length, _ = metrics.shape
     if candidates is None:
         candidates = np.ones((n_columns, len(WEIGHTS)), bool)
@@ -64,33 +55,22 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
     index = np.empty((n_bursts, n_columns, n_symbols), np.int64)
     log_prob = np.empty(index.shape)
     bit_llr = np.full((*index.shape, 7), np.nan)
-    for batch in np.array_split(np.arange(n_columns), min(max(-(-metrics.size // _AT_ONCE), 1), n_columns)):
-        trellises = _trellises(metrics[:, batch], batch, candidates)
-        for trellis in trellises:
-            w_log_evidence[trellis.columns, trellis.w - 1] = trellis.log_evidence
-        for trellis in trellises:
-            likeliest = w_log_evidence[trellis.columns].argmax(axis=1) == trellis.w - 1
-            if not likeliest.any():
-                continue
-            columns, w, posterior = trellis.columns[likeliest], trellis.w, trellis.word_posteriors(likeliest)
-            lit[:, columns, :PREAMBLE_SLOTS] = _preamble(w)
-            lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(w)).reshape(n_bursts, columns.size, -1)
-            index[:, columns] = best = posterior.argmax(axis=-1)
-            log_prob[:, columns] = _log_of_best(posterior, best)
-            bit_llr[:, columns, :, : bits_per_symbol(w)] = _bit_llr(posterior, bits_per_symbol(w))
+    trellises = _trellises(metrics, candidates)
+    for trellis in trellises:
+        w_log_evidence[trellis.columns, trellis.w - 1] = trellis.log_evidence
+    for trellis in trellises:
+        likeliest = w_log_evidence[trellis.columns].argmax(axis=1) == trellis.w - 1
+        if not likeliest.any():
+            continue
+        columns, w, posterior = trellis.columns[likeliest], trellis.w, trellis.word_posteriors(likeliest)
+        lit[:, columns, :PREAMBLE_SLOTS] = _preamble(w)
+        lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(w)).reshape(n_bursts, columns.size, -1)
+        index[:, columns] = best = posterior.argmax(axis=-1)
+        log_prob[:, columns] = _log_of_best(posterior, best)
+        bit_llr[:, columns, :, : bits_per_symbol(w)] = _bit_llr(posterior, bits_per_symbol(w))
     log_evidence = np.logaddexp.reduce(w_log_evidence, axis=1)
     weights, w_log_prob = w_log_evidence.argmax(axis=1) + 1, w_log_evidence - log_evidence[:, None]
     return BurstPosteriors(weights, w_log_prob, log_evidence, lit, index, log_prob, bit_llr, _header_llr(metrics))
-
-
-def _check(metrics: FloatArray) -> None:
-    if metrics.ndim != 4 or metrics.shape[-1] not in {1 << (m + 1) for m in range(1, MAX_MEMORY + 1)}:
-        raise ValueError(
-            f"metrics must be (bursts, columns, slots, 2**(memory+1)) with memory 1..{MAX_MEMORY} (got {metrics.shape})"
-        )
-    n_payload = metrics.shape[2] - _isi_memory_of(metrics) - PREAMBLE_SLOTS
-    if n_payload <= 0 or n_payload % SLOTS_PER_SYMBOL:
-        raise ValueError(f"metrics must hold whole packets and memory slots after them (got {metrics.shape})")
 
 
 def _isi_memory_of(metrics: FloatArray) -> int:
@@ -113,7 +93,7 @@ def _bit_llr(posterior: FloatArray, k: int) -> FloatArray:
     """(..., k) ln p(1)/p(0) from (..., 2**k) probabilities of the codebook indices."""
     bits = _states(k)
     p_one, p_zero = posterior @ bits, posterior @ (1 - bits)
-    return np.asarray(np.log(np.maximum(p_one, _MIN_WORD)) - np.log(np.maximum(p_zero, _MIN_WORD)))
+    return np.asarray(np.log(np.maximum(p_one, MIN_FLOAT32)) - np.log(np.maximum(p_zero, MIN_FLOAT32)))
 
 
 def _header_llr(metrics: FloatArray) -> FloatArray:
@@ -217,8 +197,8 @@ class _Trellis:
         return np.moveaxis(np.divide(joint, total, out=uniform, where=total > 0), 0, 2)
 
 
-def _trellises(metrics: FloatArray, columns: NDArray[np.int64], candidates: NDArray[np.bool_]) -> list[_Trellis]:
-    """Trellis of the columns of each candidate weight, from metrics (B, columns, packet + memory, patterns)."""
+def _trellises(metrics: FloatArray, candidates: NDArray[np.bool_]) -> list[_Trellis]:
+    """Trellis of the columns of each candidate weight, from metrics (B, C, packet + memory, patterns)."""
     isi_memory = _isi_memory_of(metrics)
     payload = metrics[:, :, PREAMBLE_SLOTS : metrics.shape[2] - isi_memory]
     slots = np.moveaxis(payload.reshape(*payload.shape[:2], -1, SLOTS_PER_SYMBOL, payload.shape[-1]), 2, 0)
@@ -230,9 +210,9 @@ def _trellises(metrics: FloatArray, columns: NDArray[np.int64], candidates: NDAr
     words = slots[..., isi_memory:, :].reshape(*slots.shape[:-2], -1)
     prior = top.sum(axis=(0, 1, -1))
     return [
-        _trellis(w, columns[chosen], metrics[:, chosen], words[:, :, chosen], boundary[:, :, chosen], prior[chosen])
+        _trellis(w, chosen, metrics[:, chosen], words[:, :, chosen], boundary[:, :, chosen], prior[chosen])
         for w in WEIGHTS
-        if (chosen := candidates[columns, w - 1]).any()
+        if (chosen := np.flatnonzero(candidates[:, w - 1])).size
     ]
 
 
@@ -262,7 +242,7 @@ def _trellis(
     scores = words @ branches.features
     top = scores.max(axis=-1, keepdims=True)
     # Single precision suffices for probabilities and is much faster.
-    remainder = np.maximum(np.exp((scores - top).astype(np.float32)), np.float32(_MIN_WORD))
+    remainder = np.maximum(np.exp((scores - top).astype(np.float32)), MIN_FLOAT32)
     n_words = remainder.shape[-1]
     log_scale = log_scale + known + top.sum(axis=(0, 1, -1)) + top_of_end.sum(axis=(0, 2))
     log_scale = log_scale - top[..., 0].size / len(columns) * np.log(n_words)
@@ -355,21 +335,8 @@ def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
         metrics: (B, C, packet + memory, patterns) log-likelihoods of B bursts.
         margin: log-likelihood below the likeliest weight.
     """
-    score = _weight_scores(_symbols_llr(metrics))
-    # Each metric was counted once for every slot that it covers.
-    lead = margin * (_isi_memory_of(metrics) + 1) / 2
-    return np.asarray(score >= score.max(axis=1, keepdims=True) - lead)
-
-
-def _symbols_llr(metrics: FloatArray) -> Float32Array:
-    """(B, C, symbols, 10) log-likelihood ratios of the slots of packets, header first."""
-    llr = slot_llr(metrics)
-    return llr.reshape(*llr.shape[:2], -1, SLOTS_PER_SYMBOL)
-
-
-def _weight_scores(symbols: Float32Array) -> FloatArray:
-    """(C, 9) log-likelihood of every weight, from slot log-likelihood ratios (B, C, symbols, 10)."""
-    symbols = np.clip(symbols, -SETTINGS.max_llr, SETTINGS.max_llr)
+    llr = np.clip(slot_llr(metrics), -SETTINGS.max_llr, SETTINGS.max_llr)
+    symbols = llr.reshape(*llr.shape[:2], -1, SLOTS_PER_SYMBOL)
     payload = symbols[:, :, 2:]
     coefficients = np.zeros((*payload.shape[:-1], SLOTS_PER_SYMBOL + 1))
     coefficients[..., 0] = 1.0
@@ -377,26 +344,7 @@ def _weight_scores(symbols: Float32Array) -> FloatArray:
         coefficients[..., 1:] += coefficients[..., :-1] * slot[..., None]
     words = np.array([comb(SLOTS_PER_SYMBOL, w) for w in WEIGHTS])
     score = np.log(coefficients[..., 1:SLOTS_PER_SYMBOL] / words).sum(axis=(0, 2))
-    return np.asarray(score + np.cumsum(symbols[:, :, 1], axis=2)[..., : len(WEIGHTS)].sum(axis=0))
-
-
-def initial_slot_probability(metrics: FloatArray) -> Float32Array:
-    """(B, C, packet) probability that each slot of B bursts is lit, with symbols treated as independent.
-
-    Uses `slot_llr` instead of a trellis, which is a sufficient start for the light model while the exposure is hardly
-    longer than a slot.
-
-    Args:
-        metrics: (B, C, packet + memory, patterns) log-likelihoods.
-    """
-    symbols = _symbols_llr(metrics)
-    weights = _weight_scores(symbols).argmax(axis=1) + 1
-    lit = np.empty_like(symbols)
-    for w in np.unique(weights):
-        columns = np.flatnonzero(weights == w)
-        lit[:, columns, :2] = _preamble(int(w)).reshape(2, -1)
-        words = codebook(int(w)).astype(np.float32)
-        score = symbols[:, columns, 2:] @ words.T
-        likely = np.exp(score - score.max(axis=-1, keepdims=True))
-        lit[:, columns, 2:] = likely @ words / likely.sum(axis=-1, keepdims=True)
-    return lit.reshape(*lit.shape[:2], -1)
+    score += np.cumsum(symbols[:, :, 1], axis=2)[..., : len(WEIGHTS)].sum(axis=0)
+    # Each metric was counted once for every slot that it covers.
+    lead = margin * (_isi_memory_of(metrics) + 1) / 2
+    return np.asarray(score >= score.max(axis=1, keepdims=True) - lead)

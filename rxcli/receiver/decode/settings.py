@@ -37,10 +37,9 @@ class DecodeSettings:
     max_period_packets: float = 0.5
     #: Slots by which the exposure may shift or widen a slot.
     max_shift_slots: int = 2
-    #: Distance from which columns share no light, as a share of the columns and as a number; and the correlation,
-    #: beyond that of the common headers, from which they show one light: packets reach 0.4, a lamp at least 0.65.
-    distant_share: float = 1 / 6
-    distant_columns: int = 3
+    #: Columns whose halves share no light; and the correlation of columns, beyond that of the common headers, from
+    #: which they show one light: packets reach 0.4, a lamp at least 0.65.
+    min_compared_columns: int = 6
     min_similarity: float = 0.6
 
 

@@ -18,8 +18,6 @@ from rxcli.types import BoolArray, Float32Array, FloatArray
 
 #: Oversampling of spectra, relative to the resolution of the light's length.
 _OVERSAMPLING = 4
-#: Maximum number of column pairs that are compared.
-_MAX_PAIRS = 300
 
 
 def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, packet_slots: int) -> bool:
@@ -41,7 +39,7 @@ def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, pack
 
 
 def is_common_light(value: Float32Array, weight: Float32Array, shared: float, reach: int = 0) -> bool:
-    """Whether distant columns show the same light.
+    """Whether columns half a screen apart show the same light.
 
     Args:
         value, weight: see `is_steady`.
@@ -49,17 +47,14 @@ def is_common_light(value: Float32Array, weight: Float32Array, shared: float, re
         reach: largest shift between columns, samples.
     """
     n_columns, n = value.shape
-    column_a, column_b = np.triu_indices(
-        n_columns, max(SETTINGS.distant_columns, int(SETTINGS.distant_share * n_columns))
-    )
-    if column_a.size == 0:
+    if n_columns < SETTINGS.min_compared_columns:
         return False
-    chosen = np.linspace(0, column_a.size - 1, min(column_a.size, _MAX_PAIRS)).astype(np.int64)
+    half = n_columns // 2
     observed = weight > 0
     level = (value - _mean(value, observed)) * observed
     level = level / np.maximum(np.sqrt(np.square(level).sum(axis=1, keepdims=True)), TINY)
     spectrum = np.fft.rfft(level, n + reach, axis=1)
-    moved = np.fft.irfft(spectrum[column_a[chosen]] * np.conj(spectrum[column_b[chosen]]), n + reach, axis=1)
+    moved = np.fft.irfft(spectrum[:half] * np.conj(spectrum[-half:]), n + reach, axis=1)
     similarity = np.concatenate([moved[:, : reach + 1], moved[:, moved.shape[1] - reach :]], axis=1).max(axis=1)
     return bool(np.median(similarity) > shared + (1 - shared) * SETTINGS.min_similarity)
 

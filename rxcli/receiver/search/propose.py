@@ -180,7 +180,7 @@ def _by_clock(
 
 def _clock(hypothesis: Hypothesis, profiles: RowProfiles) -> Clock | None:
     screen, camera = hypothesis.screen, hypothesis.camera
-    pooled = sync.pooled_strips(sync.binned_strips(profiles))
+    pooled = sync.binned_strips(profiles)
     rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
     exposure_slots = camera.exposure_s * screen.slot_rate_hz
     return sync.find_clock(pooled, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(pooled))

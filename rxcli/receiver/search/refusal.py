@@ -16,7 +16,7 @@ from rxcli.receiver.context import Failure, FrameContext
 from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.steady import is_common_light, periodic_share
-from rxcli.receiver.reception import Reception, contrast_of, shows_steady_light
+from rxcli.receiver.reception import Reception, shows_steady_light
 from rxcli.receiver.search.hypothesis import Hypothesis
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.settings import SETTINGS
@@ -42,7 +42,7 @@ def light_without_data(context: FrameContext, reception: Reception) -> Failure |
         return None  # No packet fits, and light of few rows is periodic for some period.
     with context.timer("detect"):
         headers, q = PREAMBLE_SLOTS / reception.clock.packet_slots, reception.samples.samples_per_slot
-        if not is_common_light(*contrast_of(reception), headers, SETTINGS.max_column_shift_slots * q):
+        if not is_common_light(*reception.contrast, headers, SETTINGS.max_column_shift_slots * q):
             return None
         joint = as_one_column(reception)
         no_header = bool(np.any(assemble.find_headerless(joint.posteriors.header_llr)))

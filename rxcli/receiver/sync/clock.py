@@ -15,25 +15,18 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import TINY, folded, header_correlation
-from rxcli.protocol import EXTREMES_SLOTS, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.numerics import TINY, folded, header_correlation, peak_offset
+from rxcli.protocol import EXTREMES_SLOTS, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
+from rxcli.receiver.light import take_places
 from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
-#: Spacing, in samples, of the nodes between which row positions are interpolated.
-_SMOOTH_SAMPLES = 8
-
-
-def pooled_strips(profiles: RowProfiles) -> RowProfiles:
-    """Bin strips in pairs for the clock search if a column has at least four."""
-    return binned_strips(profiles) if profiles.light.shape[1] >= SETTINGS.min_binned_strips else profiles
-
 
 def binned_strips(profiles: RowProfiles) -> RowProfiles:
-    """Bin strips in pairs for the initial pass; an odd number of strips is left as it is."""
-    rows, light = profiles.sensor_row, _bounded(profiles.light)
+    """Bin strips in pairs for clock search and initial pass; an odd number of strips is left as it is."""
+    rows, light = profiles.sensor_row, profiles.light
     if light.shape[1] % 2:
-        return replace(profiles, light=light)
+        return profiles
     return replace(
         profiles,
         light=(light[:, ::2] + light[:, 1::2]) * np.float32(0.5),
@@ -58,7 +51,7 @@ def resample(
         (C, S, n_samples) float32 light, 0 where not valid; and validity, 1 where a sample lies entirely on the screen.
     """
     borders = np.reshape(row0, (-1, 1)) + rows_per_sample * np.arange(n_samples + 1, dtype=np.float64)
-    light = _bounded(profiles.light.reshape(-1, profiles.light.shape[-1]))
+    light = profiles.light.reshape(-1, profiles.light.shape[-1])
     start, stop = _shown_rows(profiles.inside.reshape(light.shape))
     positions = _row_positions(profiles, borders)
     widths = np.diff(positions, axis=-1)
@@ -68,13 +61,6 @@ def resample(
     mean *= valid
     shape = (*profiles.light.shape[:2], n_samples)
     return mean.astype(np.float32).reshape(shape), valid.astype(np.float32).reshape(shape)
-
-
-def _bounded(light: Float32Array) -> Float32Array:
-    """Replace NaN and impossible light by 0, since one NaN would spoil every sum after it."""
-    if float(np.abs(light).max(initial=0.0)) <= SETTINGS.max_light:
-        return light
-    return np.where(np.abs(light) <= SETTINGS.max_light, light, np.float32(0))
 
 
 def _shown_rows(inside: BoolArray) -> tuple[IntArray, IntArray]:
@@ -93,40 +79,18 @@ def _row_positions(profiles: RowProfiles, borders: FloatArray) -> FloatArray:
         out = borders - (profiles.rows[0] - 0.5)
         return np.asarray(np.clip(out if len(out) == 1 else np.repeat(out, n_strips, axis=0), 0, n_rows))
     strips = profiles.sensor_row.reshape(-1, n_rows)
-    # Lens distortion is smooth, so positions are interpolated between a few borders and extrapolated linearly.
-    few = np.arange(0, borders.shape[1] + _SMOOTH_SAMPLES, _SMOOTH_SAMPLES)
-    at_few = borders[:, :1] + few * (borders[:, -1:] - borders[:, :1]) / max(borders.shape[1] - 1, 1)
-    at_few = np.broadcast_to(at_few, (profiles.light.shape[0], few.size)).repeat(n_strips, axis=0)
-    # Likewise between a few rows.
-    index = np.unique(np.append(np.arange(0, n_rows, _SMOOTH_SAMPLES), n_rows - 1))
-    known = strips[:, index].astype(np.float64)
-    before, after = (strips[:, [1]] - strips[:, [0]], strips[:, [-1]] - strips[:, [-2]]) if n_rows > 1 else (1.0, 1.0)
-    rows = np.concatenate([known[:, :1] - n_rows * before, known, known[:, -1:] + n_rows * after], axis=1)
-    index = np.concatenate([[-n_rows], index, [2 * n_rows - 1]]) + 0.5
-    found = np.stack([np.interp(at, strip, index) for at, strip in zip(at_few, rows, strict=True)])
-    between = np.arange(_SMOOTH_SAMPLES) / _SMOOTH_SAMPLES
-    every = found[:, :-1, None] + np.diff(found, axis=1)[:, :, None] * between
-    return np.clip(every.reshape(len(strips), -1)[:, : borders.shape[1]], 0, n_rows)
+    middles = np.arange(n_rows) + 0.5
+    each = np.broadcast_to(borders, (len(profiles.light), borders.shape[1])).repeat(n_strips, axis=0)
+    return np.stack([np.interp(at, strip, middles, 0, n_rows) for at, strip in zip(each, strips, strict=True)])
 
 
 def _integrate(values: Float32Array, positions: FloatArray) -> FloatArray:
     """Integral of piecewise constant `values` (n, R) between neighbouring `positions`; (n, positions - 1) float64."""
-    import cv2
-
-    n_rows = values.shape[1]
-    area = cv2.integral(values, sdepth=cv2.CV_64F)
-    total = area[1:] - area[:-1]
-    left = np.minimum(positions.astype(np.int64), n_rows - 1)
-    part = positions - left
-    if positions.shape[0] == 1:
-        below, above = total[:, left[0]], total[:, left[0] + 1]
-    else:
-        left += (np.arange(left.shape[0]) * (n_rows + 1))[:, None]
-        below, above = total.take(left), total.take(left + 1)
-    above -= below
-    above *= part
-    above += below
-    return np.asarray(np.diff(above, axis=1))
+    total = np.zeros((len(values), values.shape[1] + 1))
+    np.cumsum(values, axis=1, dtype=np.float64, out=total[:, 1:])
+    left = np.minimum(positions.astype(np.int64), values.shape[1] - 1)
+    below, above = take_places(total, left), take_places(total, left + 1)
+    return np.asarray(np.diff(below + (above - below) * (positions - left), axis=1))
 
 
 def contrast(
@@ -158,13 +122,13 @@ def contrast(
     high += low
     high *= np.float32(0.5)
     value = light - high
-    value /= span * np.float32(0.5) + np.float32(1.5 * sigma)
+    value /= span * np.float32(0.5) + np.float32(sigma)
     np.square(span, out=span)
     weight = span / (span + np.float32((SETTINGS.contrast_sigmas * sigma) ** 2))
     weight *= valid
     total = weight.sum(axis=1)
     value *= weight
-    return value.sum(axis=1) / (total + np.float32(1e-2)), total
+    return value.sum(axis=1) / (total + np.float32(TINY)), total
 
 
 def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot: int) -> FloatArray:
@@ -210,15 +174,14 @@ def find_clock(
     share = cv2.blur(weight / (weight + 1), (length, 1), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
     by_column = folded(2 * response - share, period)
     delays = _delays(by_column, start)
-    many_delays = np.count_nonzero(delays) > delays.size * SETTINGS.many_columns
-    if header_peak_ratio < SETTINGS.clear_header_lead or many_delays:
-        staggered_start, staggered_ratio = _staggered_comb(by_column)
-        if staggered_ratio > header_peak_ratio or many_delays:
-            delays = _delays(by_column, staggered_start)
-            middle = float(np.median(delays[delays != 0])) if delays.any() else 0.0
-            start = staggered_start + middle * SETTINGS.search_samples
-            delays = np.where(delays != 0, delays - middle, 0.0)
-            header_peak_ratio = max(header_peak_ratio, staggered_ratio)
+    staggered_start, staggered_ratio = _staggered_comb(by_column)
+    is_clearer = header_peak_ratio < min(staggered_ratio, SETTINGS.clear_header_lead)
+    if is_clearer or np.count_nonzero(delays) > delays.size * SETTINGS.many_columns:
+        delays = _delays(by_column, staggered_start)
+        middle = float(np.median(delays[delays != 0])) if delays.any() else 0.0
+        start = staggered_start + middle * SETTINGS.search_samples
+        delays = np.where(delays != 0, delays - middle, 0.0)
+        header_peak_ratio = max(header_peak_ratio, staggered_ratio)
     row0 = top + start * step
     before = int(np.ceil((row0 - top) / rows_per_slot))
     n_slots = before + int(np.ceil((bottom - row0) / rows_per_slot))
@@ -239,15 +202,9 @@ def find_clock(
 
 def _row_span(profiles: RowProfiles) -> tuple[float, float]:
     """Borders of the top and the bottom sensor row in view of any strip."""
-    observed = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
-    if observed.size == 0:
-        return 0.0, 0.0
-    top, bottom = int(observed[0]), int(observed[-1])
-    if profiles.sensor_row is None:
-        return float(profiles.rows[top]) - 0.5, float(profiles.rows[bottom]) + 0.5
-    rows = profiles.sensor_row[:, :, top : bottom + 1]
-    shown = profiles.inside[:, :, top : bottom + 1]
-    return float(rows[shown].min()) - 0.5, float(rows[shown].max()) + 0.5
+    rows = profiles.rows if profiles.sensor_row is None else profiles.sensor_row
+    shown = np.broadcast_to(rows, profiles.inside.shape)[profiles.inside]
+    return (float(shown.min()) - 0.5, float(shown.max()) + 0.5) if shown.size else (0.0, 0.0)
 
 
 def header_comb(score: FloatArray, samples_per_slot: int) -> tuple[float, float]:
@@ -262,8 +219,7 @@ def header_comb(score: FloatArray, samples_per_slot: int) -> tuple[float, float]
     best = int(score.argmax())
     if score[best] <= 0:
         return 0.0, 0.0
-    around = score[[best - 1, best, (best + 1) % score.size]]
-    offset = float(_parabola(around[None], np.array([1]))[0])
+    offset = float(peak_offset(*score[[best - 1, best, (best + 1) % score.size]]))
     return best + offset, float(score[best] / _rival(score, best, samples_per_slot))
 
 
@@ -291,7 +247,7 @@ def _staggered_comb(by_column: FloatArray) -> tuple[float, float]:
 
 
 def _delays(by_column: FloatArray, start: float) -> FloatArray:
-    """Delay of each column against the common clock, slots; 0 where it is not significant.
+    """Delay of each column against the common clock, slots; 0 where it is not significant, or only few are delayed.
 
     Args:
         by_column: (C, period) proportional to the log-likelihood ratio of a header there, copies added.
@@ -300,45 +256,30 @@ def _delays(by_column: FloatArray, start: float) -> FloatArray:
     reach = int((SETTINGS.max_delay_slots + 1) * SETTINGS.search_samples)
     score = by_column.take(round(start) + np.arange(-reach, reach + 1), axis=1, mode="wrap")
     best, top = score.argmax(axis=1), score.max(axis=1)
-    fine = (best + _parabola(score, best) - reach - (start - round(start))) / SETTINGS.search_samples
+    around = np.clip(best, 1, 2 * reach - 1)[:, None] + np.arange(-1, 2)
+    offset = peak_offset(*np.take_along_axis(score, around, 1).T)
+    fine = (best + offset - reach - (start - round(start))) / SETTINGS.search_samples
     sure = top > 0
     late = sure & (np.abs(fine) > SETTINGS.same_delay_slots)
     scattered = np.count_nonzero(late) > SETTINGS.many_columns * np.count_nonzero(sure)
-    moved = (top - score[:, reach] > 2 * SETTINGS.delay_lead) | scattered
-    return np.where(moved & sure & (best > 0) & (best < 2 * reach), fine, 0.0)
-
-
-def _parabola(score: FloatArray, best: NDArray[np.int64]) -> FloatArray:
-    rows = np.arange(best.size)
-    inner = np.clip(best, 1, score.shape[1] - 2)
-    left, middle, right = (score[rows, inner + k] for k in (-1, 0, 1))
-    curvature = left - 2 * middle + right
-    return np.clip(
-        np.divide(0.5 * (left - right), curvature, out=np.zeros_like(curvature), where=curvature < 0), -0.5, 0.5
-    )
+    return np.where(scattered & sure & (best > 0) & (best < 2 * reach), fine, 0.0)
 
 
 def corrected(clock: Clock, timing: FloatArray) -> Clock:
-    """Correct the clock by its mean lateness over the columns, and the columns' delays where there are any.
+    """Correct the clock by its lateness over all columns, and the columns' delays where there are any.
 
     Args:
         clock: the clock.
-        timing: (C, 2) numerator and denominator of each column's lateness in slots.
+        timing: (C, 2) numerator and denominator of each column's lateness, slots.
     """
+    most = SETTINGS.max_correction_slots
     numerator, denominator = timing.sum(axis=0)
-    late = (
-        float(np.clip(numerator / denominator, -SETTINGS.max_correction_slots, SETTINGS.max_correction_slots))
-        if denominator > 0
-        else 0.0
-    )
+    late = float(np.clip(numerator / max(denominator, TINY), -most, most))
     moved = replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
     own = (timing[:, 0] - late * timing[:, 1]) / (timing[:, 1] + SETTINGS.delay_information)
     if not clock.delay_slots.any() and np.sqrt(np.mean(own**2)) < SETTINGS.same_timing_slots:
         return moved
-    return replace(
-        moved,
-        delay_slots=clock.delay_slots - np.clip(own, -SETTINGS.max_correction_slots, SETTINGS.max_correction_slots),
-    )
+    return replace(moved, delay_slots=clock.delay_slots - np.clip(own, -most, most))
 
 
 def sample_slots(
@@ -420,7 +361,7 @@ def similarity(copy_a: NDArray[np.floating], copy_b: NDArray[np.floating]) -> fl
     common = (llr_a != 0) & (llr_b != 0)
     p, q = 1 / (1 + np.exp(-llr_a)), 1 / (1 + np.exp(-llr_b))
     share = ((p + q) * common).sum(axis=1, keepdims=True) / np.maximum(2 * common.sum(axis=1, keepdims=True), 1)
-    share = np.clip(share, 0.1, 0.9)
+    share = np.clip(share, WEIGHTS[0] / SLOTS_PER_SYMBOL, WEIGHTS[-1] / SLOTS_PER_SYMBOL)
     of_slots = (np.log(p * q / share + (1 - p) * (1 - q) / (1 - share)) * common).sum(axis=0)
     right, misread = np.log(1 - SETTINGS.misread_slots), np.log(SETTINGS.misread_slots)
     return float((np.logaddexp(right + of_slots, misread) - np.logaddexp(right, misread + of_slots)).sum())

@@ -9,22 +9,16 @@ from dataclasses import dataclass
 class SyncSettings:
     """Thresholds, each with its unit and its reason."""
 
-    #: Strips of a column from which the search and the initial pass bin them in pairs; and samples per slot of the
-    #: clock search.
-    min_binned_strips: int = 4
+    #: Samples per slot of the clock search.
     search_samples: int = 4
     #: Contrast, in standard deviations of a sample, at which a strip has half its full weight.
     contrast_sigmas: float = 8.0
-    #: Largest valid light, in units of white.
-    max_light: float = 1e3
 
     #: Largest delay of a column against the common clock, slots (air interface).
     max_delay_slots: float = 2.0
     #: Share of the columns that may appear delayed by more than the second number of slots when none is.
     many_columns: float = 0.25
     same_delay_slots: float = 0.12
-    #: Minimum gain of a single column's delay in header correlation, added over the copies.
-    delay_lead: float = 0.3
     #: Header lead (peak over rival) below which delayed columns are tried.
     clear_header_lead: float = 2.5
     #: Root-mean-square deviation, slots, below which columns count as undelayed in the light model.

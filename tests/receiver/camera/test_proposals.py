@@ -222,11 +222,6 @@ def test_pictures_without_stripes_propose_nothing() -> None:
     assert not (blind.propose(_flat_strips(rng.normal(0.3, 0.002, (40, 400))), SCREENS))
 
 
-def test_no_screens_is_a_mistake_of_the_caller() -> None:
-    with pytest.raises(ValueError, match="screens"):
-        blind.propose(_flat_strips(np.zeros((80, 200))), ())
-
-
 def test_rows_against_the_readout_are_turned_and_back() -> None:
     rng = np.random.default_rng(5)
     profiles = RowProfiles(

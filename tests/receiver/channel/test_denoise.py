@@ -68,7 +68,7 @@ def scene_of(slots: np.ndarray, rng: np.random.Generator, *, noise: float = 0.00
         metrics=metrics_of(9.0 * (2.0 * slots - 1), 1),
         w=np.full(len(slots), W),
         model=channel.ObservationModel(
-            0.01, NoiseModel(noise**2, 1e-6), Crosstalk(crosstalk), Exposure.of(EXPOSURE, Q, isi_memory=1)
+            0.01, NoiseModel(noise**2, 1e-6), Crosstalk(crosstalk), Exposure.of(EXPOSURE, Q)
         ),
     )
 
@@ -238,13 +238,13 @@ def test_shipped_models_make_the_words_that_were_sent_likelier(name: str) -> Non
     """Cross-entropy per word of frames not trained on, against that without a network."""
     samples = [sample for number in DOUBTFUL_FRAMES if (sample := validation_sample(number)) is not None]
     assert len(samples) == len(DOUBTFUL_FRAMES)
-    session = onnxruntime.InferenceSession(load_denoiser(name)._weights)
+    session = onnxruntime.InferenceSession(load_denoiser(name).weights)
     sums = np.zeros(2)
     for sample in samples:
         fed = {part: getattr(sample, part).astype(np.float32) for part in ("strips", "columns")}
         corrections = session.run(["correction"], fed)[0]
         sums += [cross_entropy(sample, values) for values in (corrections, np.zeros_like(corrections))]
-    assert sums[0] <= 0.92 * sums[1], sums[0] / sums[1]
+    assert sums[0] <= 0.93 * sums[1], sums[0] / sums[1]
 
 
 def test_slots_that_are_not_seen_and_preambles_are_left_alone(scene: DenoiserInput) -> None:
@@ -390,7 +390,7 @@ def test_corrections_are_kept_only_where_they_leave_less_doubt(trials: dict[str,
     found = search(trials["hard"].frame, options, Timer())
     assert not isinstance(found, Failure)
     lock = found.best.acquisition
-    seen = still.decode(lock, options.skip)
+    seen = still.decode(lock, options.skip, found.best.reception)
     better, kept, report = still.apply_autoencoder(lock, seen, options)
     assert report is not None
     assert report["kept"] == len(kept) > 0

@@ -77,9 +77,11 @@ def results_of(
     slot_margin: float | NDArray[np.float32] = 10.0,
 ) -> tuple[ColumnResult, ...]:
     """Results where every slot of the grid has the same support unless told otherwise."""
-    was_denoised = np.broadcast_to(np.asarray(slot_margin, np.float32), snr.shape)
+    margin = assemble.slot_margin_by_burst(np.broadcast_to(np.asarray(slot_margin, np.float32), snr.shape), clock)
+    features = confidence.confidence_features(posteriors, margin, np.zeros(len(snr), bool), samples.light.shape[1])
     headerless = assemble.find_headerless(posteriors.header_llr)
-    return assemble.column_results(clock, posteriors, snr, samples, was_denoised, headerless, min_confidence)
+    n_observed = assemble.slots_observed(samples, clock)
+    return assemble.column_results(clock, posteriors, snr, n_observed, features, headerless, min_confidence)
 
 
 def test_a_sure_packet() -> None:

@@ -21,7 +21,6 @@ from rxcli.protocol import (
 from rxcli.receiver.channel import metrics_of
 from rxcli.receiver.decode.detect import (
     detect,
-    initial_slot_probability,
     plausible_weights,
     slot_margin,
 )
@@ -197,19 +196,6 @@ def test_hopeless_weights_are_dropped_and_a_wide_margin_keeps_all() -> None:
     assert plausible_weights(metrics, 1e9).all()
 
 
-@pytest.mark.parametrize("isi_memory", [1, 3])
-def test_the_first_guess_is_exact_where_slots_are_independent(isi_memory: int) -> None:
-    rng = np.random.default_rng(isi_memory)
-    w = np.array([3, 5, 8])
-    tx = np.stack([packet_and_next(rng.integers(0, 1 << bits_per_symbol(i), (1, 4)), i, 0)[0] for i in w])
-    llr = (4 * (2 * tx - 1) + rng.normal(0, 3, (2, *tx.shape))).astype(np.float32)
-    metrics = np.stack([metrics_of(burst, isi_memory) for burst in llr])
-    guess = initial_slot_probability(metrics)
-    found = detect(metrics, np.array(WEIGHTS) == w[:, None])
-    np.testing.assert_allclose(guess, found.lit, atol=1e-4)
-    assert 0.01 < np.abs(guess[..., 20:] - tx[:, 20:]).mean() < 0.2
-
-
 def test_columns_and_bursts_do_not_touch_one_another() -> None:
     metrics = np.random.default_rng(3).normal(0, 1, (3, 4, 41, 4))
     whole = detect(metrics)
@@ -245,14 +231,6 @@ def test_extreme_metrics_give_finite_posteriors(kind: str, isi_memory: int) -> N
             k = bits_per_symbol(int(w))
             assert np.isfinite(found.bit_llr[:, column, :, :k]).all()
             assert (found.index[:, column] < 1 << k).all()
-
-
-@pytest.mark.parametrize(
-    "shape", [(1, 31, 4), (1, 1, 31, 3), (1, 1, 31, 2), (1, 1, 31, 256), (1, 1, 36, 4), (1, 1, 15, 4)]
-)
-def test_shapes_that_do_not_fit(shape: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match="metrics must"):
-        detect(np.zeros(shape))
 
 
 @pytest.mark.parametrize("isi_memory", [1, 3])

@@ -53,7 +53,7 @@ def received(
     for _ in range(rounds):
         posteriors = detect.detect(channel.by_burst(metrics, clock_))
         lit = clock_.on_grid(posteriors.lit)
-        found = channel.slot_likelihoods(samples, clock_, model, lit, np.arange(lit.shape[0]))
+        found = channel.slot_likelihoods(samples, clock_, model, lit, np.arange(lit.shape[0]), is_initial=True)
         metrics = found.metrics
         clock_ = sync.corrected(sync.possible_bursts(clock_, slot_llr(metrics), (REPEATS,))[0][0], found.timing)
         samples = sync.sample_slots(profiles, clock_, Q)
@@ -256,15 +256,15 @@ def test_copies_and_back() -> None:
     assert (clock_.on_grid(np.moveaxis(copies, 1, 0)) == slots).all()
 
 
-@pytest.mark.parametrize(("n_strips", "n_pooled"), [(2, 1), (3, 3), (4, 2), (6, 3), (8, 2)])
-def test_pooled_strips_keep_the_light(n_strips: int, n_pooled: int) -> None:
+@pytest.mark.parametrize(("n_strips", "n_binned"), [(2, 1), (3, 3), (4, 2), (8, 4)])
+def test_binned_strips_keep_the_light(n_strips: int, n_binned: int) -> None:
     rng = np.random.default_rng(0)
     profiles = row_profiles(random_link(rng, [5] * 2, 5), Shot(n_rows=60, n_strips=n_strips), rng)
-    pooled = sync.pooled_strips(sync.binned_strips(profiles))
-    together = n_strips // n_pooled
-    assert pooled.light.shape == (2, n_pooled, 60)
-    np.testing.assert_allclose(pooled.light[:, -1], profiles.light[:, -together:].mean(axis=1), rtol=1e-5)
-    np.testing.assert_allclose(pooled.count, together)
+    binned = sync.binned_strips(profiles)
+    together = n_strips // n_binned
+    assert binned.light.shape == (2, n_binned, 60)
+    np.testing.assert_allclose(binned.light[:, -1], profiles.light[:, -together:].mean(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(binned.count, together)
 
 
 @pytest.mark.parametrize("n", [168, 170])
