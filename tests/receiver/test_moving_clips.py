@@ -285,14 +285,14 @@ def test_a_common_clock_that_does_not_fit_a_frame_is_dropped(monkeypatch: pytest
     clip = filmed_by(at_rate(120, "paper-17k3", 8))
     plain = received(clip)[1]
 
-    def wrong(frames: list[Frame], context: FrameContext) -> Start:
+    def wrong(frames: list[Frame], context: FrameContext) -> list[Start]:
         screen = context.screens[0]
         time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
         time.begin(frames[0].index, frames[0].time_s, 5.0, screen.slot_rate_hz / 120)
-        return Start(screen, (screen,), time, 2.0)
+        return [Start(screen, (screen,), time, 2.0)]
 
     monkeypatch.setattr("rxcli.receiver.clip.acquiring.shows_little", lambda _: True)
-    monkeypatch.setattr("rxcli.receiver.clip.common_clock._agreed", wrong)
+    monkeypatch.setattr("rxcli.receiver.clip.common_clock._starts", wrong)
     monkeypatch.setattr("rxcli.receiver.clip.camera.acquisition_at", lambda *_: None)
     results, score = received(clip)
     right = score.error_free + score.extra_error_free

@@ -2,11 +2,11 @@
 
 `receiver` has the three states and the step from frame to frame. The first frames agree on an outline (`acquiring`)
 and, where each shows little, on a clock (`common_clock`); the camera is known or estimated (`camera`). From then on
-outline, clock, picture and light spread are known: the strips are read where they were (`sampling.tracked`), the
-picture is taken out (`scene`, by `channel.known_picture`), the clock is predicted and checked against the header
-(`sync.tracking`). Where the check fails, the frame is received like a photograph again. What frames show of a burst is
-added up before it is detected (`bursts`); a packet stands in the last frame that shows its burst, so results wait a
-frame (`ledger`).
+outline, clock, picture and light spread are known: the strips are read where they were (`plane.tracked`), the picture
+is taken out (`scene`, by `channel.known_picture`), the clock is predicted and checked against the header
+(`sync.tracking`). Where the check fails, the frame is received like a photograph again. The link's time numbers the
+bursts of all frames (`link`), and what frames show of a burst is added up before it is detected (`bursts`). A packet
+stands in the last frame that shows its burst, so results wait a frame (`ledger`) until they are complete (`reporting`).
 """
 
 from rxcli.receiver.clip.receiver import receive_clip

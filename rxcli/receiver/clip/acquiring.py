@@ -51,21 +51,16 @@ class FirstFrames:
     @property
     def are_enough(self) -> bool:
         """Whether no further frame is needed: the outline and, where each shows little, camera and clock are sure."""
-        if self.located.camera_error == np.inf:
-            n_needed = SETTINGS.frames_held_long if self.shows_little else SETTINGS.frames_together
-        else:
-            n_needed = SETTINGS.frames_together if self.shows_little else 1
+        is_unsure = self.located.camera_error == np.inf
+        n_needed = SETTINGS.first_frames if self.shows_little or is_unsure else 1
+        if self.shows_little and is_unsure:
+            n_needed = SETTINGS.frames_in_doubt
         return self._agree and len(self.frames) >= n_needed
 
     @property
     def _agree(self) -> bool:
         """Whether no further outline is needed."""
-        return self.texture is None or len(self.differences) >= SETTINGS.max_searches
-
-    @property
-    def _width(self) -> float:
-        left, right, *_ = self.located.context.corners
-        return float(np.linalg.norm(right - left))
+        return self.texture is None or len(self.differences) >= SETTINGS.n_outlines
 
     def agreed(self) -> Located:
         """The first frame with the outline on which all of them agree."""
@@ -83,18 +78,16 @@ class FirstFrames:
     def _compared(self, frame: Frame, found: Located | Failure | None) -> FirstFrames:
         """The same with the outline of a further frame, less its motion since the first; None: it is followed."""
         assert self.texture is not None
+        context = self.located.context
         moved = self.texture.find(frame)
         if not moved.is_precise:
-            moved = self.texture.with_outline(moved, self.located.context.corners)
+            moved = self.texture.with_outline(moved, context.corners)
         if found is None:
-            start = moved.corners + self.differences[-1]
-            corners = followed_outline(frame, start, self.located.context.screens[0])
+            corners = followed_outline(frame, moved.corners + self.differences[-1], context.screens[0])
         else:
             corners = None if found.outline is None else found.outline.corners
-        if corners is None or not moved.fits:
-            return replace(self, texture=None)
-        difference = corners - moved.corners
-        if np.abs(difference).max() > self._width / 2:
+        reach = float(np.ptp(context.corners[:, 0])) / 2
+        if corners is None or not moved.fits or np.abs(corners - moved.corners).max() > reach:
             return replace(self, texture=None)
         self.texture.learn(frame, moved)
-        return replace(self, differences=(*self.differences, difference))
+        return replace(self, differences=(*self.differences, corners - moved.corners))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from rxcli.protocol import PREAMBLE_SLOTS, WEIGHTS
+from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver import channel
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View
@@ -31,31 +31,21 @@ class Burst:
     frames: tuple[int, ...]
     #: Whether the picture was known from other frames in any of them.
     tracked: bool
-    #: (C,) columns with enough light in any of them; the others are not detected.
-    tried: BoolArray
 
     def __add__(self, burst: Burst) -> Burst:
-        metrics, more = with_common_memory([self.metrics, burst.metrics])
         return Burst(
             self.number,
-            metrics + more,
+            self.metrics + burst.metrics,
             self.n_observed + burst.n_observed,
             self.frames + burst.frames,
             self.tracked or burst.tracked,
-            self.tried | burst.tried,
         )
 
     @cached_property
     def posteriors(self) -> BurstPosteriors:
-        """Of this burst alone; columns that are not tried are unknown."""
-        columns, n_columns = np.flatnonzero(self.tried), self.tried.size
-        if not columns.size:
-            return _unobserved(n_columns, *self.metrics.shape[1:])
-        metrics = self.metrics[None, columns]
-        found = detect.detect(metrics, detect.plausible_weights(metrics, receiver_settings.weight_margin))
-        if columns.size == n_columns:
-            return found
-        return _unobserved(n_columns, *self.metrics.shape[1:]).with_columns(columns, found)
+        """Of this burst alone."""
+        metrics = self.metrics[None]
+        return detect.detect(metrics, detect.plausible_weights(metrics, receiver_settings.weight_margin))
 
     @property
     def certain(self) -> BoolArray:
@@ -86,22 +76,15 @@ class Burst:
         )
 
 
-def bursts_of(view: View, tried: BoolArray) -> list[Burst]:
-    """What a frame shows of its bursts; `tried` (C,) are the columns to detect."""
+def bursts_of(view: View) -> list[Burst]:
+    """What a frame shows of its bursts."""
     assert view.numbers is not None
     own = view.bursts
     metrics = channel.by_burst(own.metrics, own.clock)
     return [
-        Burst(number, metrics[index], own.shown[own.clock.burst == index].sum(axis=0), (own.frame,), own.tracked, tried)
+        Burst(number, metrics[index], own.shown[own.clock.burst == index].sum(axis=0), (own.frame,), own.tracked)
         for index, number in enumerate(view.numbers.tolist())
     ]
-
-
-def has_light(view: View) -> BoolArray:
-    """(C,) columns of a frame with enough light to try; now and then, and of a photograph, all of them."""
-    if view.flat is None or (view.bursts.frame + 1) % SETTINGS.try_dark_every == 0:
-        return np.ones(len(view.snr), bool)
-    return np.asarray(view.snr[:, 0] >= SETTINGS.dark_snr)
 
 
 def lit_slots(view: View, bursts: Sequence[Burst]) -> Float32Array:
@@ -124,29 +107,3 @@ def doubts(view: View, bursts: Sequence[Burst]) -> tuple[int, int]:
         n_doubtful += int((log_prob < SETTINGS.doubtful_log_prob).sum())
         n_whole += log_prob.size
     return n_doubtful, n_whole
-
-
-def with_common_memory(metrics: Sequence[FloatArray]) -> list[FloatArray]:
-    """Convert metrics (..., n + memory, patterns) of several frames to the longest ISI memory among them.
-
-    A metric of a shorter memory applies to every longer pattern that ends with its slots.
-    """
-    n_patterns = max((some.shape[-1] for some in metrics), default=0)
-    n_metrics = max((some.shape[-2] for some in metrics), default=0)
-
-    def written(some: FloatArray) -> FloatArray:
-        if some.shape[-1] == n_patterns:
-            return some
-        every = some[..., np.arange(n_patterns) % some.shape[-1]]
-        more = [(0, 0)] * (some.ndim - 2)
-        return np.pad(every, [*more, (0, n_metrics - some.shape[-2]), (0, 0)])
-
-    return [written(some) for some in metrics]
-
-
-@lru_cache(maxsize=8)
-def _unobserved(n_columns: int, n_metrics: int, n_patterns: int) -> BurstPosteriors:
-    """Posteriors of the columns of a burst without light."""
-    middle = np.arange(len(WEIGHTS)) == len(WEIGHTS) // 2
-    blank = detect.detect(np.zeros((1, 1, n_metrics, n_patterns)), middle[None])
-    return replace(blank, lit=np.full_like(blank.lit, 0.5)).of_columns(np.zeros(n_columns, np.int64))

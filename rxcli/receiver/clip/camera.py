@@ -13,7 +13,6 @@ from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
 from rxcli.receiver.reception import Reception
 from rxcli.receiver.search import Found, search
-from rxcli.receiver.search.refusal import light_without_data
 from rxcli.receiver.search.settings import SETTINGS as search_settings
 from rxcli.receiver.still import initial_pass
 from rxcli.types import FloatArray, Frame
@@ -89,11 +88,11 @@ class ClipCamera:
     def locate(self, frame: Frame, timer: Timer) -> Located | Failure:
         """Find the screen in a frame, and the camera where it is not known; a failure where there is none."""
         found = search(frame, self.options, timer, self.context)
-        context = found.best.context if isinstance(found, Found) else found.context
+        context = found.best.context if isinstance(found, Found) else found.context or self.context
         if found.outline is None or context is None:
             assert isinstance(found, Failure)
             return found
-        return Located(found.outline, replace(context, corners=found.outline.corners), found)
+        return Located(found.outline, replace(context, frame=frame, corners=found.outline.corners), found)
 
     def acquire(self, located: Located, start: Start | None, timer: Timer) -> tuple[ClipCamera, Acquired | Failure]:
         """Find the clock of a frame; its camera is known from then on.
@@ -108,8 +107,7 @@ class ClipCamera:
         camera = replace(self, context=context)
         predicted = None if start is None else acquisition_at(start, context)
         if predicted is not None:
-            initial = initial_pass(predicted)
-            return camera, light_without_data(context, initial) or Acquired(context, predicted, initial)
+            return camera, Acquired(context, predicted, initial_pass(predicted))
         at = replace(self.options, corners=corners)
         found = located.found or search(frame, at, timer, context)
         if isinstance(found, Failure):

@@ -148,12 +148,13 @@ def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | 
     state = replace(state, known=replace(state.known, frame=frame))
     if reason is not None:
         counter, message = reason
-        waiting.skip(counter)
-        waiting.update(message=message)
+        waiting.update(skipped={counter: 1}, message=message)
         return state, ledger.add(waiting)
-    view: View | Failure | None = _tracked_view(state, frame, timer)
+    view: View | Failure | None = None
+    if isinstance(state, Tracking) and state.known.camera.fits(frame):
+        view = state.scene.view(frame, ledger.time, timer)
     if isinstance(state, Tracking) and view is not None:
-        waiting.skip("tracking")
+        waiting.update(skipped={"tracking": 1})
         state = replace(state, known=replace(state.known, corners=state.scene.corners))
     else:
         state, view, report = _receive_anew(state.known, frame, located, timer)
@@ -192,24 +193,13 @@ def _is_doubled(frame: Frame, before: Frame, corners: FloatArray | None) -> bool
     """
     if corners is None or before.pixels.shape != frame.pixels.shape:
         return False
-    left, top = np.maximum(corners.min(axis=0), 0).astype(int)
-    right, bottom = np.maximum(corners.max(axis=0), 0).astype(int)
-    screen = np.s_[top : bottom : SETTINGS.same_step, left : right : SETTINGS.same_step]
-    pixels, earlier = (each.pixels[screen].astype(np.float32) for each in (frame, before))
-    if min(pixels.shape) < 2:
-        return False
+    inside = np.clip(corners, 0, [frame.width - 1, frame.height - 1])
+    columns, rows = np.linspace(inside.min(axis=0), inside.max(axis=0), SETTINGS.same_points).astype(int).T
+    pixels, earlier = (each.pixels[np.ix_(rows, columns)].astype(np.float32) for each in (frame, before))
     contrast = float(np.abs(np.diff(pixels, axis=0)).mean())
-    changed = float(np.abs(pixels - earlier).mean())
-    unit = (frame.white - frame.black) / 255
-    return contrast > SETTINGS.same_contrast * unit and changed < SETTINGS.same_share * contrast
-
-
-def _tracked_view(state: Tracking | Lost, frame: Frame, timer: Timer) -> View | None:
-    """The view of a frame by what is known; None where that does not fit."""
-    time = state.known.ledger.time
-    if not isinstance(state, Tracking) or time is None or not state.known.camera.fits(frame):
-        return None
-    return state.scene.view(frame, time, timer)
+    if contrast < SETTINGS.min_contrast * (frame.white - frame.black):
+        return False
+    return float(np.abs(pixels - earlier).mean()) < SETTINGS.same_share * contrast
 
 
 # -- a frame like a photograph -----------------------------------------------------------------------------------------

@@ -54,37 +54,28 @@ class ClipSettings:
     #: Variance of a strip's light, at least: that of a starved clip's dark parts is none.
     min_variance: float = 1e-7
 
-    #: Frames at the start of a scene that are looked at once more when the picture is known better; how many are waited
-    #: for where compression has taken much; and the share of the well lit packets that are then in doubt.
-    frames_held: int = 6
-    frames_held_long: int = 24
+    #: First frames whose outlines are compared. First frames that are taken together: for the clock where each shows
+    #: little, for the phase of the bursts and for the picture; number where these leave doubt; and share of well lit
+    #: packets in doubt.
+    n_outlines: int = 5
+    first_frames: int = 6
+    frames_in_doubt: int = 24
     much_doubt: float = 0.03
     #: An estimated camera that gives this many times the evidence of packets replaces the named one.
     unlike_evidence: float = 4.0
-    #: Spacing of the pixels compared with the frame before; minimum change from row to row, grey levels of 255, and
-    #: share of it by which a repeated frame may differ.
-    same_step: int = 31
-    same_contrast: float = 3.0
+    #: Points across and down the screen that are compared with the frame before; least change from row to row, in units
+    #: of white, and share of it by which a repeated frame may differ.
+    same_points: int = 32
+    min_contrast: float = 0.01
     same_share: float = 0.25
     #: How much longer than from one frame to the next a readout may seem to take: time stamps are rounded.
     readout_slack: float = 1.1
-    #: Frames that find their clock together where each shows little.
-    frames_together: int = 8
-    #: Frames that may wait until it is clear which copies begin a burst.
-    max_waiting_frames: int = 8
 
     #: A burst of a column all of whose symbols have at least this log probability is not decoded again.
     certain_log_prob: float = -1e-4
     #: Squared contrast over variance of a slot that is well lit, and log probability of a packet in doubt.
     well_lit_snr: float = 10.0
     doubtful_log_prob: float = -0.05
-    #: Squared contrast over variance of a slot, at which all copies of a packet together do not give one.
-    dark_snr: float = 0.5
-    #: Dark columns are tried all the same in one frame in this many.
-    try_dark_every: int = 30
-
-    #: First frames whose outlines are compared.
-    max_searches: int = 5
 
     #: A frame that shows fewer packets than this finds its clock with others; one that shows more does better alone.
     few_packets: float = 1.05

@@ -71,9 +71,3 @@ class Waiting:
     def update(self, **fields: Any) -> None:
         """Set fields of the result."""
         self.result = replace(self.result, **fields)
-
-    def skip(self, name: str, count: int = 1) -> None:
-        """Count what was skipped in the result."""
-        if count:
-            skipped = self.result.skipped
-            self.update(skipped={**skipped, name: skipped.get(name, 0) + count})

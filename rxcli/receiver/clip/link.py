@@ -1,0 +1,104 @@
+"""The link's time through a clip: it gives every burst of every frame its number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rxcli.receiver.clip.common_clock import Start
+from rxcli.receiver.clip.views import View
+from rxcli.receiver.decode import assemble, confidence
+from rxcli.receiver.decode.settings import SETTINGS as decode_settings
+from rxcli.receiver.light import slot_llr
+from rxcli.receiver.sync import tracking
+from rxcli.types import BoolArray, FloatArray, Frame
+
+
+@dataclass(slots=True, eq=False)
+class Link:
+    """The link's time, as long as it is not lost, and the bursts that it counts."""
+
+    time: tracking.LinkTime
+    phase: tracking.BurstPhase
+    #: Columns, slots of a packet and patterns of the metrics; another screen is seen where these differ.
+    shape: tuple[int, ...]
+    #: Number of burst 0 of this time in the clip, and the lowest number above all bursts so far.
+    offset: int = 0
+    next_number: int = 0
+    #: Counts the starts of the link's time: burst numbers of different ones cannot be compared.
+    epoch: int = 1
+    last_time_s: float = 0.0
+    #: Whether time stamps were compared with the link's time.
+    stamps_judged: bool = False
+    #: (1, C) log-likelihood ratio of the headers of all bursts so far; a scalar 0 before any.
+    header_llr: FloatArray | float = 0.0
+
+    @classmethod
+    def begin(cls, view: View, start: Start | None, stretch: float) -> Link:
+        """Begin with a frame; its time is that of `start` if the first frames agreed on one."""
+        screen = view.acquisition.screen
+        time = start.time if start else tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
+        return cls(time, tracking.BurstPhase(view.acquisition.repeats), _shape(view), stamps_judged=stretch != 1)
+
+    def after(self, before: Link, frame: Frame) -> Link:
+        """Count on from an earlier time, with the bursts that passed until a frame."""
+        passed_s = (frame.time_s - before.last_time_s) / self.time.stretch
+        passed = int(passed_s * self.time.slot_rate_hz / (self.time.packet_slots * before.phase.repeats))
+        offset = before.next_number + passed
+        return replace(self, offset=offset, next_number=offset, epoch=before.epoch + 1)
+
+    def place(self, view: View) -> bool:
+        """Find the place of a frame's copies in the link's time; False where its clock contradicts it."""
+        if self.shape != _shape(view):
+            return False
+        frame, own = view.context.frame, view.bursts
+        first_copy = self.time.update(frame.index, frame.time_s, own.clock)
+        if first_copy is None:
+            return False
+        view.bursts, self.last_time_s = replace(own, first_copy=first_copy), frame.time_s
+        if not self.phase.settled:
+            copies = own.clock.to_copies(slot_llr(own.metrics)).transpose(1, 0, 2)
+            self.phase.update(first_copy, np.asarray(copies * (own.shown > 0), np.float64))
+        return True
+
+    def number(self, view: View) -> None:
+        """Number the bursts of a frame."""
+        clock = view.bursts.clock
+        bursts = self.phase.burst_of(view.bursts.first_copy + np.arange(clock.n_copies))
+        numbers = np.unique(bursts)
+        view.bursts = replace(view.bursts, clock=replace(clock, burst=bursts - numbers[0]))
+        view.numbers = numbers + self.offset
+        self.next_number = max(self.next_number, int(view.numbers[-1]) + 1)
+
+    def predicted(self, frame: Frame, rows: FloatArray, rows_per_slot: float) -> list[int]:
+        """Numbers of the bursts that the rows (R,) of a further frame should show; none if that is not known."""
+        slot = self.time.predict(frame.index, frame.time_s)
+        if slot is None or not self.phase.settled:
+            return []
+        top, bottom = ((slot + rows[[0, -1]] / rows_per_slot) // self.time.packet_slots).astype(np.int64)
+        numbers: list[int] = (np.unique(self.phase.burst_of(np.arange(top, bottom + 1))) + self.offset).tolist()
+        return numbers
+
+    def estimate_stretch(self, view: View) -> float | None:
+        """Ratio of time stamps to the link's time by the first clocks; None if no factor explains them.
+
+        Args:
+            view: a frame; the next one begins after its readout.
+        """
+        self.stamps_judged = True
+        shown = np.flatnonzero(view.acquisition.profiles.inside.any(axis=(0, 1)))
+        readout_slots = float(np.ptp(shown)) / view.bursts.clock.rows_per_slot
+        return self.time.time_stamp_stretch(readout_slots / self.time.slot_rate_hz)
+
+    def headerless(self, closed: Sequence[confidence.BurstInClip], n_columns: int) -> BoolArray:
+        """Add closed bursts; returns (C,) the columns that have shown no headers."""
+        limit = decode_settings.max_llr
+        for burst in closed:
+            self.header_llr = self.header_llr + np.clip(burst.posteriors.header_llr, -limit, limit)
+        return assemble.find_headerless(np.asarray(self.header_llr)) if closed else np.zeros(n_columns, bool)
+
+
+def _shape(view: View) -> tuple[int, ...]:
+    return view.acquisition.screen.columns, view.bursts.clock.packet_slots, view.bursts.metrics.shape[-1]

@@ -1,0 +1,79 @@
+"""The result of a frame of a clip: the packets of the bursts that it shows last."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rxcli.options import ReceiverOptions
+from rxcli.receiver.clip.bursts import Burst
+from rxcli.receiver.clip.link import Link
+from rxcli.receiver.clip.views import View, Waiting
+from rxcli.receiver.decode import assemble
+from rxcli.receiver.decode.confidence import BurstInClip
+from rxcli.receiver.decode.soft_bits import clip_soft_bits
+from rxcli.results.dump import dump_stages
+from rxcli.types import FrameResult, IntArray
+
+
+def completed(
+    waiting: Waiting,
+    link: Link,
+    closed: Sequence[Burst],
+    going_on: Sequence[Burst],
+    options: ReceiverOptions,
+    certainty: float,
+) -> FrameResult:
+    """The result of a received frame.
+
+    Args:
+        waiting: the frame.
+        link: that numbered its bursts.
+        closed: its bursts that no later frame shows.
+        going_on: its other bursts.
+        options: of the receiver.
+        certainty: probability that the screen's columns are numbered right.
+    """
+    result, view = waiting.result, waiting.view
+    assert view is not None
+    ended = [burst.ended(view) for burst in closed]
+    columns = assemble.clip_results(
+        view.bursts.clock,
+        ended,
+        np.max([np.zeros(len(view.snr), np.float32), *(burst.probability for burst in going_on)], axis=0),
+        view.snr,
+        link.headerless(ended, len(view.snr)),
+        options.min_confidence,
+        certainty,
+    )
+    if view.denoised:
+        columns = tuple(replace(column, denoised=column.column in view.denoised) for column in columns)
+    if view.context.camera.reversed:
+        columns = tuple(assemble.in_stored_rows(column, view.height) for column in columns)
+    if options.dump_dir is not None:
+        dump_stages(options.dump_dir, result.source, result.frame, _taps(result, view, ended))
+    soft = None
+    if options.soft_bits:
+        soft = clip_soft_bits(ended, assemble.snr_db_of_columns(view.snr), link.epoch)
+    if soft is not None:
+        soft = replace(soft, source=result.source, frame=result.frame, time_s=result.time_s)
+    name = view.acquisition.variant(link.phase.repeats).name
+    status = assemble.clip_status(columns)
+    return replace(result, columns=columns, status=status, screen_profile=name, soft_bits=soft)
+
+
+def _taps(result: FrameResult, view: View, ended: Sequence[BurstInClip]) -> dict[str, Any]:
+    """What is written of a frame: as of a photograph, but strips as tracking samples them, and bursts that end here."""
+    found: dict[str, Any] = {"geometry.corners": result.corners, "clock": view.bursts.clock}
+    if view.light is not None and view.pose is not None:
+        rows = view.pose.rows.astype(np.int64)
+        found |= {"sampling.light": view.light, "sampling.inside": view.pose.map.inside, "sampling.rows": rows}
+    else:
+        found["sampling"] = view.acquisition.profiles
+    numbers: IntArray = np.array([burst.number for burst in ended], np.int64)
+    found |= {"channel.metrics": view.bursts.metrics, "bursts.shown": view.bursts.shown}
+    found |= {"bursts.number": view.numbers, "bursts.ended": numbers}
+    return found | {f"detect.{burst.number}": burst.posteriors for burst in ended}
