@@ -365,7 +365,7 @@ def test_known_picture_gives_back_the_columns_light() -> None:
     picture = rng.uniform(0.02, 0.5, (columns, strips, rows)).astype(np.float32)
     crosstalk = rng.uniform(0.1, 1.0, (strips, 3))
     inside = np.ones(picture.shape, bool)
-    known = KnownPicture(inside, Crosstalk(crosstalk), black_level, NoiseModel(1e-7, 1e-6))
+    known = KnownPicture(picture.shape, Crosstalk(crosstalk), black_level, NoiseModel(1e-7, 1e-6))
 
     def frame() -> tuple[np.ndarray, np.ndarray]:
         bits = rng.integers(0, 2, (columns, 42)).astype(np.float32)
@@ -380,9 +380,9 @@ def test_known_picture_gives_back_the_columns_light() -> None:
 
     for _ in range(25):
         light, slots = frame()
-        known.learn(Observation(light, slots, np.ones_like(slots)))
+        known.learn(Observation(light, slots, np.ones_like(slots), inside))
     light, slots = frame()
-    reception = known.solve(light)
+    reception = known.placed(inside).solve(light)
     assert np.abs(reception.value - slots).max() < 0.1
     assert (reception.precision > 0).all()
 
@@ -391,7 +391,8 @@ def known_picture(rng: np.random.Generator, columns: int = 6, strips: int = 4, r
     """A picture known from many frames, 5 rows a slot; and what makes a frame of it: light and exposed slots."""
     picture = rng.uniform(0.1, 0.5, (columns, strips, rows)).astype(np.float32)
     crosstalk = np.tile([0.0, 1.0, 0.0], (strips, 1))
-    known = KnownPicture(np.ones(picture.shape, bool), Crosstalk(crosstalk), 0.0, NoiseModel(1e-6, 0.0))
+    inside = np.ones(picture.shape, bool)
+    known = KnownPicture(picture.shape, Crosstalk(crosstalk), 0.0, NoiseModel(1e-6, 0.0))
 
     def frame() -> tuple[Float32Array, Float32Array]:
         bits = rng.integers(0, 2, (columns, rows // 5 + 2)).astype(np.float32)
@@ -400,7 +401,7 @@ def known_picture(rng: np.random.Generator, columns: int = 6, strips: int = 4, r
 
     for _ in range(20):
         light, slots = frame()
-        known.learn(Observation(light, slots, np.ones_like(slots)))
+        known.learn(Observation(light, slots, np.ones_like(slots), inside))
     return known, frame
 
 
@@ -409,8 +410,9 @@ def test_strips_that_show_something_else_are_trusted_less() -> None:
     known, frame = known_picture(rng)
     light, slots = frame()
     light[:, 0] += rng.normal(0, 0.2, light[:, 0].shape).astype(np.float32)
-    plain = np.abs(known.solve(light).value - slots).mean()
-    again = np.abs(known.solve_again(light, slots, 5.0).value - slots).mean()
+    placed = known.placed(np.ones(light.shape, bool))
+    plain = np.abs(placed.solve(light).value - slots).mean()
+    again = np.abs(placed.solve_again(light, slots, 5.0).value - slots).mean()
     assert again < 0.5 * plain
 
 
@@ -420,7 +422,8 @@ def test_a_decision_does_not_bear_itself_out() -> None:
     light, slots = frame()
     wrong = slots.copy()
     wrong[2, 200:205] = 1 - wrong[2, 200:205]
-    reception = known.solve_again(light, wrong, 5.0).value[2, 201:204]
+    placed = known.placed(np.ones(light.shape, bool))
+    reception = placed.solve_again(light, wrong, 5.0).value[2, 201:204]
     assert np.abs(reception - slots[2, 201:204]).max() < 0.1
 
 
@@ -428,7 +431,7 @@ def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
     known, frame = known_picture(np.random.default_rng(10))
     other = copy.deepcopy(known)
     light, slots = frame()
-    look = Observation(light, slots, np.full_like(slots, 0.7))
+    look = Observation(light, slots, np.full_like(slots, 0.7), np.ones(light.shape, bool))
     update = known.learn(look, forget=False)
     with_it, _ = known.picture()
     without, _ = known.without(update).picture()
@@ -441,13 +444,12 @@ def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
 def test_errors_that_rows_have_in_common_count_as_one(together: int) -> None:
     """Noise of the same variance on every row alone, or on five rows at a time: the latter leaves less to be told."""
     rng = np.random.default_rng(11)
-    known = KnownPicture(
-        np.ones((8, 1, 1000), bool), Crosstalk(np.array([[0.0, 1.0, 0.0]])), 0.0, NoiseModel(1e-4, 0.0)
-    )
+    inside = np.ones((8, 1, 1000), bool)
+    known = KnownPicture(inside.shape, Crosstalk(np.array([[0.0, 1.0, 0.0]])), 0.0, NoiseModel(1e-4, 0.0))
     noise = np.repeat(rng.normal(0, 0.1, (8, 1000 // together)), together, axis=1).astype(np.float32)
     slots = np.repeat(rng.integers(0, 2, (8, 200)), 5, axis=1).astype(np.float32)
-    seen = ColumnLight(slots + noise, np.full((8, 1000), 50, np.float32), slots)
-    judged = known.judge(seen, slots, 40.0, 0.0, 5.0)
+    seen = ColumnLight(slots + noise, np.full((8, 1000), 50, np.float32))
+    judged = known.placed(inside).judge(seen, slots, 40.0, 0.0, 5.0)
     assert judged is not None
     # Each row tells 1 / 0.1^2, whatever was foreseen; five that err together tell what one does.
     expected = 100 / together
@@ -457,34 +459,32 @@ def test_errors_that_rows_have_in_common_count_as_one(together: int) -> None:
 def test_black_parts_of_a_picture_show_no_slots() -> None:
     """The black bar of a letterboxed picture, whose slots are unknown: it is black whatever is sent."""
     rng = np.random.default_rng(12)
-    known = KnownPicture(
-        np.ones((3, 4, 300), bool), Crosstalk(np.tile([0.0, 1.0, 0.0], (4, 1))), 0.0, NoiseModel(1e-7, 1e-4)
-    )
+    inside = np.ones((3, 4, 300), bool)
+    known = KnownPicture(inside.shape, Crosstalk(np.tile([0.0, 1.0, 0.0], (4, 1))), 0.0, NoiseModel(1e-7, 1e-4))
     slots = np.repeat(rng.integers(0, 2, (3, 60)), 5, axis=1).astype(np.float32)
     light = (0.3 * slots[:, None] + rng.normal(0, 3e-4, (3, 4, 300))).astype(np.float32)
     slots[:, 200:] = 0.5
     light[..., 200:] = rng.normal(0, 3e-4, (3, 4, 100))
-    known.learn(Observation(light, slots, np.abs(2 * slots - 1)))
-    precision = known.solve(light).precision
+    known.learn(Observation(light, slots, np.abs(2 * slots - 1), inside))
+    precision = known.placed(inside).solve(light).precision
     assert np.median(precision[:, :200]) > 50
     assert np.median(precision[:, 250:]) < 0.2
 
 
 def test_rows_that_were_never_lit_are_not_known() -> None:
     """Light that neighbours spill is no look at a picture: what is lit there at last is not taken for dark."""
-    known = KnownPicture(
-        np.ones((3, 1, 60), bool), Crosstalk(np.array([[0.05, 0.9, 0.05]])), 0.0, NoiseModel(1e-6, 1e-6)
-    )
+    inside = np.ones((3, 1, 60), bool)
+    known = KnownPicture(inside.shape, Crosstalk(np.array([[0.05, 0.9, 0.05]])), 0.0, NoiseModel(1e-6, 1e-6))
     lit = np.zeros((3, 60), np.float32)
     lit[0] = 1.0
     # The model has it that the neighbour spills a twentieth; three times as much comes.
     light = np.where(np.arange(3)[:, None] == 1, 0.15, 0.9)[:, None] * np.ones((3, 1, 60)) * lit[:1]
     for _ in range(4):
-        known.learn(Observation(light.astype(np.float32), lit, np.ones((3, 60), np.float32)))
+        known.learn(Observation(light.astype(np.float32), lit, np.ones((3, 60), np.float32), inside))
     both = lit.copy()
     both[1] = 1.0
     now = (np.array([0.95, 0.95, 0.05])[:, None, None] * np.ones((3, 1, 60))).astype(np.float32)
-    seen = known.solve(now)
+    seen = known.placed(inside).solve(now)
     assert (seen.precision[1] * (1 - seen.value[1]) < 8).all()
 
 

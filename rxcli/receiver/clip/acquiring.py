@@ -81,7 +81,7 @@ class FirstFrames:
         context = self.located.context
         moved = self.texture.find(frame)
         if not moved.is_precise:
-            moved = self.texture.with_outline(moved, context.corners)
+            moved = replace(moved, corners=context.corners)
         if found is None:
             corners = followed_outline(frame, moved.corners + self.differences[-1], context.screens[0])
         else:

@@ -14,22 +14,13 @@ class ClipSettings:
     #: Movement that is none: pixels, or standard deviations of what was found.
     still_px: float = 0.3
     still_sds: float = 2.5
-    #: With little texture: standard deviation of a screen at rest in screen sizes, standard deviations within which a
-    #: motion may be rest, and standard deviation of the position of a moving screen.
-    rest_sd: float = 0.0005
-    rest_sds: float = 4.0
-    moving_sd: float = 0.003
-    #: Rows at the screen's ends that are not counted on where a screen moves, least and most, beside one standard
-    #: deviation of the corners. A row beyond the end is dark, whatever the known picture expects there.
-    min_end_rows: float = 1.0
-    max_end_rows: float = 14.0
-    #: Interval of outline searches if the picture does not locate a screen at rest, and searches that establish rest.
+    #: Rows at the ends of a moving screen that are not used: beyond the end it is dark, whatever the picture is there.
+    end_rows: int = 2
+    #: Interval of searches for a screen at rest, and searches that establish rest.
     look_every: int = 8
     still_looks: int = 3
-    #: In screen widths: how far an outline may be from where the screen was to be there still, and how far it may move
-    #: from one frame to the next to be found.
-    same_outline: float = 0.005
-    outline_reach: float = 0.02
+    #: Inverse of the variance of a row's slots at which the row is not used for the picture.
+    doubt_weight: float = 8.0
     #: Frames from which the picture is learned one by one, and how often from then on.
     first_updates: int = 12
     update_every: int = 12
@@ -47,10 +38,9 @@ class ClipSettings:
     exposure_change: float = 0.3
     #: Share of a frame's noise in what is expected of the next.
     frame_share: float = 0.2
-    #: Contrast of its headers at which the predicted clock is accepted.
+    #: Contrast of its headers at which the predicted clock is accepted; and steps of the search near it, slots.
     good_header: float = 0.6
-    #: Gain in header contrast at which another clock replaces the predicted one.
-    better_header: float = 0.1
+    clock_step: float = 0.5
     #: Variance of a strip's light, at least: that of a starved clip's dark parts is none.
     min_variance: float = 1e-7
 

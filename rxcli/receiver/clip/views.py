@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.channel.known_picture import ColumnLight, Placement
+from rxcli.receiver.channel.known_picture import ColumnLight
 from rxcli.receiver.context import FrameContext
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.sync.tracking import FrameBursts
@@ -20,17 +20,10 @@ class Pose:
     #: (4, 2) pixels, the viewer's top-left first.
     corners: FloatArray
     map: tracked.StripMap
-    #: Where the known picture lies on the frame's rows; None for where it was when its screen was found.
-    placement: Placement | None = None
-    #: The strips on whose rows that picture is known; None for these.
-    known_on: tracked.StripMap | None = None
-    #: (C, n) rows of the same points down every column as of the screen the picture is known of; None where that is it.
-    middles: FloatArray | None = None
-
-    @property
-    def home(self) -> tracked.StripMap:
-        """The strips on whose rows the picture is known that lies here."""
-        return self.known_on or self.map
+    #: The strips on whose rows the picture is known.
+    home: tracked.StripMap
+    #: (C, R) row of the known picture at each row of the frame; None where the screen is where it was first.
+    picture_row: Float32Array | None = None
 
     @property
     def rows(self) -> FloatArray:

@@ -232,7 +232,7 @@ def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
 def _stands_out(strips: Strips, grid: Grid) -> bool:
     """Whether borders half a column further on explain less, by more than chance."""
     by_chance = grid.explained / np.sqrt(strips.picture_rows)
-    return bool(grid.contrast > SETTINGS.min_contrast * by_chance)
+    return bool(grid.contrast > by_chance)
 
 
 def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> list[OutlineCandidate]:

@@ -34,7 +34,7 @@ _CELLS, _PARTS = (108, 360), (6, 18)
 #: Cells of a coarse cell down and across, and smoothing of the coarse texture in such cells.
 _COARSE, _COARSE_BLUR = np.array([2, 4]), 0.8
 #: Adjacent fine cells along a row, whose most informative one is compared; and minimum number of rows read in a cell.
-_COMPARED_OF, _ROWS_READ = 2, 3
+_COMPARED_OF, _ROWS_READ = 4, 3
 #: Screen sizes around the expected screen that are searched.
 _REACH = 0.06
 #: Share of the screen's size beyond its sides that belongs to the texture: the sides help to locate it.
@@ -49,28 +49,21 @@ _DARK_PERCENT = 8.0
 _ABOVE_NOISE, _LOCAL_CELLS = 1.3, 15
 #: Maximum iterations of a fit, and motion of the corners, cells, after which it ends. Fine detail makes a whole
 #: Gauss-Newton step too long.
-_ITERATIONS, _CONVERGED, _STEP_SHARE = 8, 0.1, 0.7
+_ITERATIONS, _CONVERGED, _STEP_SHARE = 8, 0.2, 0.7
 #: Standard deviations beyond which a cell is an outlier: a hand, a reflection.
 _OUTLIER = 2.5
+#: Number of neighbouring cells whose errors are fully correlated, as those of the stripes that remain.
+_CORRELATED_CELLS = 4.0
 #: Standard deviations of a prediction in screen sizes: shift, affine modes, perspective modes.
 #: A screen's size is its width, or the width that its height implies on pixels that are not square.
 _SHIFT_SD, _AFFINE_SD, _PERSPECTIVE_SD = 0.008, 0.0027, 0.0004
-#: Information below which there is no texture, 1 over pixels squared. Number of neighbouring cells whose errors are
-#: fully correlated.
-_MIN_INFORMATION, _CORRELATED_CELLS = 1e-9, 4.0
-#: Standard deviation of an outline found in a frame, screen sizes.
-_OUTLINE_SD = 0.002
 #: Maximum standard deviation of the corners in screen sizes, and minimum correlation of the textures, of a certain
 #: position.
 _MAX_SD, _MIN_CORRELATION = 0.0012, 0.35
-#: Share of the last frame's motion that the next is expected to repeat.
-_PERSISTENCE = 0.7
 #: Number of first frames that each update the texture, and the interval of updates afterwards.
 _FIRST_FRAMES, _LEARN_EVERY = 10, 8
 #: Maximum weight of the earlier frames in the texture, in frames.
 _MAX_WEIGHT = 40.0
-#: Points down and across through which the screen is projected.
-_KNOTS = (9, 17)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,15 +72,10 @@ class Registration:
 
     #: (4, 2) pixels of the stored picture, the viewer's top-left first.
     corners: FloatArray
-    #: (8, 8) covariance of the corners, x and y of each in turn, pixels squared.
-    covariance: FloatArray
+    #: Standard deviation of the corners, pixels, root mean square.
+    sd_px: float
     #: Correlation of the frame's texture with the known one, -1..1.
     correlation: float
-
-    @property
-    def sd_px(self) -> float:
-        """Standard deviation of the corners, root mean square."""
-        return float(np.sqrt(np.trace(self.covariance) / 8))
 
     @property
     def is_precise(self) -> bool:
@@ -115,9 +103,8 @@ class _Texture:
 class _Known:
     """The known texture of P parts of the screen, on the K most informative cells of each."""
 
-    #: Cells of the whole screen down and across, and (P, K) indices of the compared ones.
-    shape: tuple[int, int]
-    cells: IntArray
+    #: (3, P, K) u, v and 1 of the cells on the screen.
+    points: FloatArray
     #: (P, K) texture, and its reliability, 0..1.
     value: Float32Array
     trust: Float32Array
@@ -141,43 +128,34 @@ class ScreenTexture:
         height, width = (sides[1] + sides[3]) / 2, (sides[0] + sides[2]) / 2
         #: Pixels of a cell across and down.
         self._cell = max(round(width / _CELLS[1]), 1), max(round(height / _CELLS[0]), 1)
-        self._plane = self._before = geometry.undistort(corners, self._lens).copy()
+        self._plane = geometry.undistort(corners, self._lens)
         self._n_frames = 0
         #: Value and weight of the known texture, and the same on coarse and on fine cells; None if to be recomputed.
         self._mean: Float32Array = np.zeros((*_CELLS, 2), np.float32)
         self._known: tuple[_Known, _Known] | None = None
         self._read_last: tuple[Frame, _Texture] | None = None
-        self.learn(frame, Registration(corners, np.zeros((8, 8)), 1.0))
+        self.learn(frame, Registration(corners, 0.0, 1.0))
 
     def find(self, frame: Frame) -> Registration:
         """Register the screen in the next frame."""
         if self._known is None:
             self._known = _known_of(_coarser(self._mean), 1), _known_of(self._mean, _COMPARED_OF)
-        plane = expected = self._plane + _PERSISTENCE * (self._plane - self._before).mean(axis=0)
+        plane = self._plane
         fine = self._texture_of(frame)
         coarse = _Texture(_coarser(fine.values), fine.origin, fine.cell * _COARSE[::-1])
         for texture, known in zip((coarse, fine), self._known, strict=True):
-            plane, covariance, correlation = self._fit(texture, known, plane, expected)
-        return Registration(geometry.distort(plane, self._lens), covariance, correlation)
-
-    def with_outline(self, found: Registration, outline: FloatArray, sd: float = _OUTLINE_SD) -> Registration:
-        """Combine a registration with an outline (4, 2) of standard deviation `sd`, screen sizes."""
-        measured, at = geometry.undistort(outline, self._lens), geometry.undistort(found.corners, self._lens)
-        information = np.linalg.inv(found.covariance)
-        known = 1 / (sd * _size(outline)) ** 2
-        covariance = np.asarray(np.linalg.inv(information + known * np.eye(8)), np.float64)
-        plane = covariance @ (information @ at.ravel() + known * measured.ravel())
-        return Registration(geometry.distort(plane.reshape(4, 2), self._lens), covariance, found.correlation)
+            plane, sd_px, correlation = self._fit(texture, known, plane)
+        return Registration(geometry.distort(plane, self._lens), sd_px, correlation)
 
     def learn(self, frame: Frame, found: Registration) -> None:
         """Update the texture with a frame in which the screen was found."""
-        self._before, self._plane = self._plane, geometry.undistort(found.corners, self._lens)
+        self._plane = geometry.undistort(found.corners, self._lens)
         self._n_frames += 1
         if self._n_frames > _FIRST_FRAMES and self._n_frames % _LEARN_EVERY:
             return
         self._known = None
-        x, y = self._places(self._texture_of(frame), self._plane, _CELLS)
-        value, weight = _read(self._texture_of(frame), x, y)
+        texture = self._texture_of(frame)
+        value, weight = _read(texture, *self._places(texture, self._plane, _points(*_CELLS)))
         mean, before = np.moveaxis(self._mean, 2, 0)
         total = before + weight
         mean += (value - mean) * (weight / np.maximum(total, np.float32(TINY)))
@@ -194,16 +172,13 @@ class ScreenTexture:
             self._read_last = frame, _texture_of(frame, start, end, *self._cell)
         return self._read_last[1]
 
-    def _fit(
-        self, texture: _Texture, known: _Known, plane: FloatArray, expected: FloatArray
-    ) -> tuple[FloatArray, FloatArray, float]:
-        """Corners (4, 2) on the undistorted picture, their covariance (8, 8), and the textures' correlation.
+    def _fit(self, texture: _Texture, known: _Known, plane: FloatArray) -> tuple[FloatArray, float, float]:
+        """Corners (4, 2) on the undistorted picture, their standard deviation, and the textures' correlation.
 
         Args:
             texture: of the frame.
             known: of the screen, on cells of the same size.
             plane: corners to begin with.
-            expected: corners as predicted.
         """
         prior, (shares, pairs) = _prior_of_one() / _size(plane) ** 2, _corner_shares()
         # From the corners' motion along u and v to pixels, with the screen approximated by a parallelogram.
@@ -211,8 +186,7 @@ class ScreenTexture:
         inverse = np.linalg.inv(np.stack([side_u, side_v], axis=1) / 2)
         to_pixels = (np.eye(4)[:, :, None] * inverse[:, None, None]).reshape(8, 8)
         for _ in range(_ITERATIONS):
-            x, y = self._places(texture, plane, known.shape)
-            value, weight = _read(texture, x.take(known.cells), y.take(known.cells))
+            value, weight = _read(texture, *self._places(texture, plane, known.points))
             error, weight = known.value - value, weight * known.trust
             squared = error * error
             variance = max(float(np.vdot(weight, squared)) / max(float(weight.sum()), TINY), TINY)
@@ -221,27 +195,23 @@ class ScreenTexture:
             along_corners = (products @ pairs).reshape(2, 2, 4, 4).swapaxes(1, 2).reshape(8, 8)
             normal = to_pixels.T @ along_corners @ to_pixels
             along = np.einsum("npk,pk->np", known.gradient, weight * error)
-            scores = (along[:, None] * shares).reshape(8, -1).T @ to_pixels
-            # The normal matrix is scaled to the information that the scatter of the parts leaves.
-            scale = max(float(np.square(scores).sum() / max(np.trace(normal), TINY)), TINY)
-            slope = scores.sum(axis=0) / scale + prior @ (expected - plane).ravel()
-            step = np.linalg.solve(normal / scale + prior, slope) * _STEP_SHARE
+            noise = _CORRELATED_CELLS * variance
+            slope = (along @ shares.T).ravel() @ to_pixels / noise + prior @ (self._plane - plane).ravel()
+            step = np.linalg.solve(normal / noise + prior, slope) * _STEP_SHARE
             plane = plane + step.reshape(4, 2)
             if np.abs(step.reshape(4, 2) / texture.cell).max() < _CONVERGED:
                 break
         power = float((weight * known.value**2).sum() * (weight * value**2).sum())
         correlation = float((weight * known.value * value).sum()) / max(power, TINY**2) ** 0.5
-        return plane, _sandwich(normal, scores, variance, prior), correlation
+        sd_px = float(np.sqrt(np.trace(np.linalg.inv(normal / noise + prior)) / 8))
+        return plane, sd_px, correlation
 
-    def _places(
-        self, texture: _Texture, plane: FloatArray, shape: tuple[int, int]
-    ) -> tuple[Float32Array, Float32Array]:
-        """x and y of the screen's cells (V, U), in cells of a frame's texture, with the screen at `plane`."""
-        knots, down, across = _positions(*shape)
-        projected = knots @ geometry.homography(plane).T
-        pixels = geometry.distort(projected[:, :2] / projected[:, 2:], self._lens)
-        x, y = ((pixels + 0.5 - texture.origin) / texture.cell - 0.5).T.reshape(2, *_KNOTS).astype(np.float32)
-        return np.asarray(down @ x @ across, np.float32), np.asarray(down @ y @ across, np.float32)
+    def _places(self, texture: _Texture, plane: FloatArray, points: FloatArray) -> tuple[Float32Array, Float32Array]:
+        """x and y of `points` (3, n, m) of the screen, in cells of a frame's texture, with the screen at `plane`."""
+        x, y, scale = np.tensordot(geometry.homography(plane), points, 1)
+        pixels = geometry.distort(np.stack([x / scale, y / scale], axis=-1), self._lens)
+        x, y = ((pixels[..., axis] + (0.5 - texture.origin[axis])) / texture.cell[axis] - 0.5 for axis in (0, 1))
+        return x.astype(np.float32), y.astype(np.float32)
 
 
 def _read(texture: _Texture, x: Float32Array, y: Float32Array) -> tuple[Float32Array, Float32Array]:
@@ -260,10 +230,10 @@ def _texture_of(frame: Frame, start: IntArray, end: IntArray, cell_x: int, cell_
     pixels: NDArray[Any] = frame.pixels[top : top + n_y * cell_y, left : left + n_x * cell_x]
     every = max(cell_y // _ROWS_READ, 1)
     rows = range((cell_y - 1) % every // 2, cell_y, every)
-    sums = np.zeros((n_y, n_x * cell_x), np.float32)
-    for row in rows:
-        sums += pixels[row::cell_y]
-    coded = cv2.resize(sums, (n_x, n_y), interpolation=cv2.INTER_AREA) / np.float32(len(rows))
+    sums = pixels[rows[0] :: cell_y].astype(np.uint16 if pixels.dtype == np.uint8 else np.float32)
+    for row in rows[1:]:
+        np.add(sums, pixels[row::cell_y], out=sums)
+    coded = cv2.resize(sums, (n_x, n_y), interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(len(rows))
     coded = np.clip((coded - np.float32(frame.black)) / np.float32(frame.white - frame.black), 0, 1)
     # The tone curve is undone roughly: any of the usual ones is accurate enough.
     light = coded if frame.linear else coded * coded
@@ -316,7 +286,8 @@ def _known_of(texture: Float32Array, of_cells: int) -> _Known:
     cells = cells.reshape(down, len(value) // down, across, -1).swapaxes(1, 2).reshape(down * across, -1)
     gradient = gradient.reshape(2, -1).take(cells, axis=1)
     products = np.stack([gradient[0] ** 2, gradient[0] * gradient[1], gradient[1] ** 2])
-    return _Known(value.shape, cells, value.take(cells), trust.take(cells), gradient, products)
+    points = _points(*value.shape).reshape(3, -1).take(cells, axis=1)
+    return _Known(points, value.take(cells), trust.take(cells), gradient, products)
 
 
 @cache
@@ -334,25 +305,10 @@ def _fractions(n: int) -> FloatArray:
 
 
 @cache
-def _positions(n_v: int, n_u: int) -> tuple[FloatArray, Float32Array, Float32Array]:
-    """(knots, 3) points of the screen, and interpolation from these: (V, knots down) and (knots across, U)."""
-    knots_v, knots_u = (np.linspace(-_MARGIN, 1 + _MARGIN, n) for n in _KNOTS)
-    grid_v, grid_u = np.meshgrid(knots_v, knots_u, indexing="ij")
-    knots = np.stack([grid_u, grid_v, np.ones_like(grid_u)], axis=-1).reshape(-1, 3)
-    down, across = (
-        np.stack([np.interp(_fractions(n), at, unit) for unit in np.eye(at.size)], axis=1).astype(np.float32)
-        for n, at in ((n_v, knots_v), (n_u, knots_u))
-    )
-    return knots, down, np.ascontiguousarray(across.T)
-
-
-def _sandwich(normal: FloatArray, scores: FloatArray, variance: float, prior: FloatArray) -> FloatArray:
-    """(8, 8) sandwich covariance of a fit, from the scatter of its parts, white noise and the prior."""
-    bread = np.linalg.inv(normal + (1e-6 * np.trace(normal) + _MIN_INFORMATION) * np.eye(8))
-    scatter = scores - scores.mean(axis=0)
-    noise = _CORRELATED_CELLS * variance * (normal + _MIN_INFORMATION * np.eye(8))
-    covariance = bread @ (scatter.T @ scatter + noise) @ bread + 1e-4 * np.eye(8)
-    return np.asarray(np.linalg.inv(np.linalg.inv(covariance) + prior))
+def _points(n_v: int, n_u: int) -> FloatArray:
+    """(3, V, U) u, v and 1 of the cells of the screen."""
+    u, v = np.meshgrid(_fractions(n_u), _fractions(n_v))
+    return np.stack([u, v, np.ones_like(u)])
 
 
 def _size(corners: FloatArray) -> float:

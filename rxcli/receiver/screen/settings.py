@@ -73,8 +73,6 @@ class FinderSettings:
     last_steps: int = 2
     #: Factor by which the followed width of a grid of narrow columns grows at a time.
     reach_gain: float = 1.4
-    #: Minimum contrast, as a share of the explained light times the root of the number of rows.
-    min_contrast: float = 0.95
     #: Focal length of a camera that no profile describes, picture widths.
     focal_widths: float = 0.8
     #: Gauss-Newton steps with decided slots, and prior standard deviations of the finder's columns: shift and widths in

@@ -72,8 +72,8 @@ def _halves(strips: Strips, mixes: Mixes) -> Iterator[tuple[slice, Float32Array]
     # Neighbouring strips have nearly the same mix, so half the normal matrix serves either half of them.
     normal = np.matmul(turned, weighted) / 2 + np.float32(SETTINGS.ridge) * np.eye(len(turned[0]), dtype=np.float32)
     inverse = np.linalg.inv(normal)
-    for known, others in ((slice(0, None, 2), slice(1, None, 2)), (slice(1, None, 2), slice(0, None, 2))):
-        yield others, np.matmul(inverse, np.matmul(turned[..., known], strips.changes[:, known]))
+    for known, predicted in ((slice(0, None, 2), slice(1, None, 2)), (slice(1, None, 2), slice(0, None, 2))):
+        yield predicted, np.matmul(inverse, np.matmul(turned[..., known], strips.changes[:, known]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,9 +24,9 @@ from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, Ro
 
 def binned_strips(profiles: RowProfiles) -> RowProfiles:
     """Bin strips in pairs for clock search and initial pass; an odd number of strips is left as it is."""
-    rows, light = profiles.sensor_row, profiles.light
+    rows, light = profiles.sensor_row, _bounded(profiles.light)
     if light.shape[1] % 2:
-        return profiles
+        return replace(profiles, light=light)
     return replace(
         profiles,
         light=(light[:, ::2] + light[:, 1::2]) * np.float32(0.5),
@@ -51,7 +51,7 @@ def resample(
         (C, S, n_samples) float32 light, 0 where not valid; and validity, 1 where a sample lies entirely on the screen.
     """
     borders = np.reshape(row0, (-1, 1)) + rows_per_sample * np.arange(n_samples + 1, dtype=np.float64)
-    light = profiles.light.reshape(-1, profiles.light.shape[-1])
+    light = _bounded(profiles.light.reshape(-1, profiles.light.shape[-1]))
     start, stop = _shown_rows(profiles.inside.reshape(light.shape))
     positions = _row_positions(profiles, borders)
     widths = np.diff(positions, axis=-1)
@@ -61,6 +61,13 @@ def resample(
     mean *= valid
     shape = (*profiles.light.shape[:2], n_samples)
     return mean.astype(np.float32).reshape(shape), valid.astype(np.float32).reshape(shape)
+
+
+def _bounded(light: Float32Array) -> Float32Array:
+    """Replace NaN and impossible light by 0, since one NaN would spoil every sum after it."""
+    if float(np.abs(light).max(initial=0.0)) <= SETTINGS.max_light:
+        return light
+    return np.where(np.abs(light) <= SETTINGS.max_light, light, np.float32(0))
 
 
 def _shown_rows(inside: BoolArray) -> tuple[IntArray, IntArray]:

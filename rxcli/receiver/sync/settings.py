@@ -13,6 +13,8 @@ class SyncSettings:
     search_samples: int = 4
     #: Contrast, in standard deviations of a sample, at which a strip has half its full weight.
     contrast_sigmas: float = 8.0
+    #: Largest valid light, in units of white.
+    max_light: float = 1e3
 
     #: Largest delay of a column against the common clock, slots (air interface).
     max_delay_slots: float = 2.0

@@ -110,7 +110,9 @@ class LinkTime:
                 return float(stretch)
         return None
 
-    def clock_at(self, frame: int, time_s: float, like: Clock, n_slots: int, top_row: float) -> Clock | None:
+    def clock_at(
+        self, frame: int, time_s: float, like: Clock, n_slots: int, top_row: float, later_slots: float = 0.0
+    ) -> Clock | None:
         """Predict the clock of a frame from earlier frames.
 
         Args:
@@ -119,11 +121,12 @@ class LinkTime:
             like: a clock of an earlier frame.
             n_slots: slots of the grid.
             top_row: sensor row above which nothing is visible.
+            later_slots: slots by which the frame is later than predicted.
         """
         predicted = self.predict(frame, time_s)
         if predicted is None:
             return None
-        slot = predicted + top_row / like.rows_per_slot
+        slot = predicted + later_slots + top_row / like.rows_per_slot
         first_slot = int(np.floor(slot)) % self.packet_slots
         return replace(
             like,

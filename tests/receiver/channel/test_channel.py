@@ -165,7 +165,8 @@ def test_timing_tells_how_late_the_clock_is(late: float) -> None:
         off = replace(now, row0=now.row0 + late * now.rows_per_slot)
         samples = sync.sample_slots(profiles, off, Q)
         timing = channel.slot_likelihoods(samples, off, model, lit, np.arange(6), is_initial=True).timing
-        found.append(timing[0] / timing[1])
+        numerator, denominator = timing.sum(axis=0)
+        found.append(numerator / denominator)
         moved = sync.corrected(off, timing)
         assert abs(moved.row0 - now.row0) <= abs(off.row0 - now.row0) + 0.02 * now.rows_per_slot
     if late == 0.0:

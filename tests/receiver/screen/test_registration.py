@@ -67,13 +67,13 @@ def test_a_fit_ends_when_the_corners_rest(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_many_frames_know_better_than_one() -> None:
-    panel = texture()
-    known = ScreenTexture(picture_of(panel, CORNERS, 1), CORNERS, None)
-    first = known.find(picture_of(panel, CORNERS, 2)).sd_px
-    for seed in range(2, 8):
-        frame = picture_of(panel, CORNERS, seed)
-        known.learn(frame, known.find(frame))
-    assert known.find(picture_of(panel, CORNERS, 9)).sd_px < first
+    panel, moved = texture(), CORNERS + np.array([2.0, 1.0])
+
+    def error_px(known: ScreenTexture) -> float:
+        found = [known.find(picture_of(panel, moved, seed)).corners for seed in range(9, 13)]
+        return float(np.square(np.array(found) - moved).mean()) ** 0.5
+
+    assert error_px(known_of(panel)) < 0.5 * error_px(ScreenTexture(picture_of(panel, CORNERS, 1), CORNERS, None))
 
 
 def test_a_skew_of_rows_is_a_motion_of_corners() -> None:
@@ -81,17 +81,6 @@ def test_a_skew_of_rows_is_a_motion_of_corners() -> None:
     panel = texture()
     skewed = CORNERS + np.array([[-2.5, 0], [-2.5, 0], [2.5, 0], [2.5, 0]])
     assert known_of(panel).find(picture_of(panel, skewed, 9)).corners == pytest.approx(skewed, abs=1.2)
-
-
-def test_stripes_are_not_followed() -> None:
-    """On a flat picture nothing moves but the stripes."""
-    flat = np.full((300, 520), 0.6, np.float32)
-    known = ScreenTexture(picture_of(flat, CORNERS, 1), CORNERS, None)
-    for seed in range(2, 8):
-        frame = picture_of(flat, CORNERS, seed)
-        found = known.with_outline(known.find(frame), CORNERS, 0.0005)
-        assert np.abs(found.corners - CORNERS).max() < 4
-        known.learn(frame, found)
 
 
 def test_stripes_on_a_flat_picture_seem_to_move_it_little() -> None:
@@ -108,13 +97,3 @@ def test_another_picture_fits_worse() -> None:
     known = known_of(texture(1))
     same, other = (known.find(picture_of(texture(seed), CORNERS, 9)).correlation for seed in (1, 2))
     assert same > other + 0.1
-
-
-def test_what_is_known_of_rest_counts() -> None:
-    """Between what the texture says and what an outline says, each by its precision."""
-    known = known_of(texture())
-    found = known.find(picture_of(texture(), CORNERS + np.array([5.0, 0.0]), 9))
-    firm = known.with_outline(found, CORNERS, 1e-6)
-    loose = known.with_outline(found, CORNERS, 1.0)
-    assert firm.corners == pytest.approx(CORNERS, abs=0.1)
-    assert loose.corners == pytest.approx(found.corners, abs=0.1)

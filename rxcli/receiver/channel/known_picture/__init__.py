@@ -5,30 +5,27 @@ crosstalk and m the exposure-averaged slots of the columns (see `channel`). In a
 frames. The m of all columns on a row then solve a small linear system, for all rows at once. This removes crosstalk,
 weights strips by their information, and gives each column as a single series with a precision.
 
-`picture` estimates T and solves for m, `exposure` applies the exposure to slots, `response` fits the effect of
+`picture` estimates T, `equations` solves for m, `exposure` applies the exposure to slots, `response` fits the effect of
 compression, `header` measures the contrast of headers, and `metrics` computes slot log-likelihoods.
 """
 
-from rxcli.receiver.channel.known_picture.exposure import expected_light, row_positions, trusted
+from rxcli.receiver.channel.known_picture.exposure import expected_light, row_positions
 from rxcli.receiver.channel.known_picture.header import dark_light, first_decision, header_contrast, header_dark
 from rxcli.receiver.channel.known_picture.metrics import slot_likelihoods
-from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Observation, Placement
-from rxcli.receiver.channel.known_picture.response import Fit, exposures, fit_response
+from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Observation, PlacedPicture
+from rxcli.receiver.channel.known_picture.response import fit_response
 
 __all__ = [
     "ColumnLight",
-    "Fit",
     "KnownPicture",
     "Observation",
-    "Placement",
+    "PlacedPicture",
     "dark_light",
     "expected_light",
-    "exposures",
     "first_decision",
     "fit_response",
     "header_contrast",
     "header_dark",
     "row_positions",
     "slot_likelihoods",
-    "trusted",
 ]

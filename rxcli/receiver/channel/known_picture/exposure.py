@@ -7,22 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.receiver.channel.known_picture.settings import SETTINGS
-from rxcli.receiver.light import SlotLight, exposure_shares, take_places
+from rxcli.receiver.light import exposure_shares
 from rxcli.types import Clock, Float32Array, FloatArray, IntArray
-
-
-def trusted(lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Float32Array:
-    """(C, R) reliability 0..1 of rows for learning, from the probabilities `lit` of their slots; see `SlotLight`."""
-    doubt = SlotLight(lit * (1 - lit)).mean_over(positions, exposure_slots)
-    return np.asarray(np.clip(1 - 8 * doubt, 0, 1), np.float32)
-
-
-def read_between(values: FloatArray, place: FloatArray) -> FloatArray:
-    """Interpolate `values` (C, n) linearly at positions (C, R) or (1, R)."""
-    place = np.clip(place, 0, values.shape[1] - 1.001)
-    left = place.astype(np.intp)
-    low = take_places(values, left)
-    return np.asarray(low + (take_places(values, left + 1) - low) * (place - left))
 
 
 def row_positions(rows: FloatArray, clock: Clock) -> FloatArray:

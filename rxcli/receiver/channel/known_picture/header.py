@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
-from rxcli.receiver.channel.known_picture.exposure import read_between
 from rxcli.receiver.channel.known_picture.picture import ColumnLight
 from rxcli.receiver.channel.known_picture.settings import SETTINGS
-from rxcli.receiver.light import sees_dark_header
+from rxcli.receiver.light import sees_dark_header, take_places
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray
 
 
@@ -20,14 +19,18 @@ def first_decision(observed: ColumnLight, positions: FloatArray, clock: Clock) -
         positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
         clock: the clock.
     """
-    middles = np.arange(clock.n_slots) + 0.5
-    total = np.zeros((observed.value.shape[0], observed.value.shape[1] + 1))
-    np.cumsum((observed.value - np.float32(0.5)) * observed.precision, axis=1, out=total[:, 1:])
-    step = positions[:, -1:] - positions[:, :1]
-    rows = (middles - positions[:, :1]) * ((positions.shape[1] - 1) / step) + 0.5
-    reach = 0.35 * clock.rows_per_slot
-    before, after = np.split(read_between(total, np.concatenate([rows - reach, rows + reach], axis=1)), 2, axis=1)
-    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * (after - before)), np.float32)
+    n_rows, reach = positions.shape[1], SETTINGS.decision_reach * clock.rows_per_slot
+    steepness = (n_rows - 1) / (positions[:, -1:] - positions[:, :1])
+    middle = (np.arange(clock.n_slots) + 0.5 - positions[:, :1]) * steepness
+    top = np.ceil(middle - reach).astype(np.intp)
+    # One more row, without light, for rows beyond the ends and for slots of one row less.
+    weighted = np.zeros((len(observed.value), n_rows + 1), np.float32)
+    np.multiply(observed.value - np.float32(0.5), observed.precision, out=weighted[:, :-1])
+    llr = np.zeros((len(weighted), clock.n_slots), np.float32)
+    for rows in (top + place for place in range(int(2 * reach) + 1)):
+        is_near = (rows <= middle + reach) & (rows >= 0) & (rows < n_rows)
+        llr += take_places(weighted, np.where(is_near, rows, n_rows))
+    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * llr), np.float32)
 
 
 def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) -> float:

@@ -11,13 +11,10 @@ class KnownPictureSettings:
 
     #: Forgetting factor: share of its weight that a frame keeps with each later frame.
     memory_share: float = 0.95
-    #: Weight of the picture of the neighbouring rows relative to one observation of a row at full light.
+    #: Weight of the mean light of neighbouring rows relative to one observation of a row at full light.
     smooth_weight: float = 0.05
-    #: Inverse of the uncertain share of a strip's light at which it is not used for the picture.
-    doubt_weight: float = 1.4
-    #: Squared error of the predicted light of a strip, relative to full light, and its increase with uncertain slots.
+    #: Squared error of the predicted light of a strip, relative to full light.
     prediction_error: float = 0.01
-    uncertain_error: float = 0.125
     #: Rows on each side from which the picture of a row that was never lit is interpolated.
     around_rows: int = 4
     #: Relative error of an interpolated picture, and of a well observed one.
@@ -49,6 +46,8 @@ class KnownPictureSettings:
     response_bounds: tuple[tuple[float, float], ...] = ((0.3, 1.3), (-0.1, 0.35), (-0.2, 0.2), (-0.4, 0.4))
     response_ridge: float = 1e-4
 
+    #: Distance from the middle of a slot within which rows count for its first decision, slots.
+    decision_reach: float = 0.35
     #: Minimum number of dark rows of a strip, over all frames, for its dark light.
     min_dark_rows: int = 12
     #: Minimum number of header rows, times the precision of the prior, for a header contrast.
@@ -57,9 +56,8 @@ class KnownPictureSettings:
     #: Distance of the blur taps, slots.
     side_slots: float = 0.5
 
-    #: Row step for the signal-to-noise ratio of a column, and for the exposure of a frame.
+    #: Row step for the signal-to-noise ratio of a column.
     snr_every_row: int = 5
-    gain_every_row: int = 7
 
 
 SETTINGS = KnownPictureSettings()
