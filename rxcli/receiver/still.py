@@ -91,12 +91,16 @@ def initial_pass(acquisition: Acquisition) -> Reception:
     return Reception(clock, samples, contrast, posteriors, likelihoods.snr, model, likelihoods.metrics)
 
 
-def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[Reception]:
-    """Receptions with the copies assigned to bursts in other ways; none if the similarity of copies leaves no doubt."""
+def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[tuple[Reception, float]]:
+    """Receptions with the copies assigned to bursts in other ways; none if the similarity of copies leaves no doubt.
+
+    Each comes with the log-likelihood by which its copies are less similar.
+    """
     (_, similarity), *rivals = sync.possible_bursts(reception.clock, slot_llr(reception.metrics), acquisition.repeats)
     for clock, rival_similarity in rivals:
         if similarity - rival_similarity <= SETTINGS.plain_bursts or not reception.is_complete.any():
-            yield replace(reception, clock=clock, posteriors=_detect(reception.metrics, clock))
+            rival = replace(reception, clock=clock, posteriors=_detect(reception.metrics, clock))
+            yield rival, similarity - rival_similarity
 
 
 def as_one_column(reception: Reception) -> Reception:

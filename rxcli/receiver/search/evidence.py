@@ -24,19 +24,19 @@ def log_evidence(reception: Reception) -> float:
 
 
 def score(reception: Reception, evidence: float, log_prior: float) -> float:
-    """Tempered evidence plus log prior; a complete packet adds to it.
+    """Tempered evidence of distinct columns plus log prior.
 
     Args:
         reception: initial pass, of all columns or of some.
         evidence: see `log_evidence`.
         log_prior: of the hypothesis.
     """
-    return SETTINGS.temper * (distinct_share(reception) * evidence + completeness(reception)) + log_prior
+    return tempered(reception, distinct_share(reception) * evidence) + log_prior
 
 
-def completeness(reception: Reception) -> float:
-    """Evidence that a complete packet adds."""
-    return SETTINGS.complete_packet * bool(reception.is_complete.any())
+def tempered(reception: Reception, evidence: float) -> float:
+    """Tempered evidence; a complete packet adds to it."""
+    return SETTINGS.temper * (evidence + SETTINGS.complete_packet * bool(reception.is_complete.any()))
 
 
 def middle_score(scored: Scored) -> float:

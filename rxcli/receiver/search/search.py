@@ -239,7 +239,8 @@ def _in_likeliest_bursts(scored: Scored) -> Scored:
     if scored.evidence < SETTINGS.bail:
         return scored
     hypothesis, context, acquisition = scored.hypothesis, scored.context, scored.acquisition
-    receptions = in_other_bursts(acquisition, scored.reception)
-    rivals = (_rated(hypothesis, context, acquisition, reception) for reception in receptions)
+    ways = [(scored, 0.0)]
+    for reception, behind in in_other_bursts(acquisition, scored.reception):
+        ways.append((_rated(hypothesis, context, acquisition, reception), behind))
     # Not by score: it distrusts columns that send the same, and wrong bursts make them differ.
-    return max([scored, *rivals], key=lambda rival: rival.evidence + evidence.completeness(rival.reception))
+    return max(ways, key=lambda way: evidence.tempered(way[0].reception, way[0].evidence) - way[1])[0]
