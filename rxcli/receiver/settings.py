@@ -23,7 +23,7 @@ class WiringSettings:
     #: Log-likelihood below the best weight at which a weight is dropped.
     weight_margin: float = 20.0
     #: Lead of an assignment of copies to bursts, log-likelihood of their similarity, that is beyond doubt.
-    plain_bursts: float = 48.0
+    plain_bursts: float = 24.0
     #: Log-likelihood ratio from which a column has packets even without a header; wrong clocks reach 74.
     min_headerless_llr: float = 100.0
 

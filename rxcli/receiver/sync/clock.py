@@ -321,7 +321,7 @@ def possible_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> 
     scores = copy_similarity(llr, clock)
     out: dict[bytes, tuple[Clock, float]] = {}
     for _, burst in _assignments(clock.n_copies, repeats):
-        score = float(np.where(burst[1:] == burst[:-1], scores, -scores).sum())
+        score = float(np.where(burst[1:] == burst[:-1], scores, -scores).sum()) / 2
         out.setdefault(burst.tobytes(), (replace(clock, burst=burst), score))
     return sorted(out.values(), key=lambda assignment: -assignment[1])
 
