@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.receiver.plane.settings import SETTINGS
 from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
 
+#: Minimum number of cells of a row, several for every strip of a hundred columns; and of a picture rotated by 90
+#: degrees, which is searched for wide columns only.
+_MIN_CELLS, _TURNED_CELLS = 1500, 400
 #: Rows read at a time, chosen to fit the processor's cache.
 BAND_ROWS = 64
 
@@ -43,7 +45,7 @@ def turned(plane: LightPlane) -> LightPlane:
     import cv2
 
     cells = np.diff(plane.sums, axis=0)
-    cell_px = max(cells.shape[1] // plane.cell_px // SETTINGS.turned_cells, 1)
+    cell_px = max(cells.shape[1] // plane.cell_px // _TURNED_CELLS, 1)
     n = cells.shape[1] // (cell_px * plane.cell_px)
     rows = cells[:, : n * cell_px * plane.cell_px]
     sums = np.zeros((n + 1, len(cells)), np.float32)
@@ -55,7 +57,7 @@ def turned(plane: LightPlane) -> LightPlane:
 def _cell_px(width: int, period: int) -> int:
     """Width of a cell: the largest period times a power of two that leaves at least `min_cells` cells."""
     cell_px = period
-    while width // (2 * cell_px) >= SETTINGS.min_cells:
+    while width // (2 * cell_px) >= _MIN_CELLS:
         cell_px *= 2
     return cell_px
 

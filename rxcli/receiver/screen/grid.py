@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import flat_places
 from rxcli.types import FloatArray, Lens
 
+#: Prior standard deviations of perspective and of radial distortion.
+_PERSPECTIVE_SD, _RADIAL_SD = 0.15, 0.004
 _INVERSE_STEPS = 12
 #: Gauss-Newton steps to a grid through given columns; their spacing, as they lie on a smooth surface; their precision,
 #: columns to the power of minus two.
@@ -133,7 +134,7 @@ def grid_step(numbers: FloatArray, off: FloatArray, weight: FloatArray, slopes: 
         weight: (n,) their precision.
         slopes: (6, n), see `grid_slopes`.
     """
-    tilt, radial = SETTINGS.perspective_sd**-2, SETTINGS.radial_sd**-2
+    tilt, radial = _PERSPECTIVE_SD**-2, _RADIAL_SD**-2
     prior = np.array([0, 0, 0, tilt, tilt, radial])
     normal = (slopes * weight) @ slopes.T
     gradient = slopes @ (weight * off) - prior * numbers

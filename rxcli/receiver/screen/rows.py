@@ -12,7 +12,6 @@ import numpy as np
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen.grid import Grid, columns_at, straightened
-from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import Float32Array, FloatArray
 
@@ -20,8 +19,10 @@ from rxcli.types import Float32Array, FloatArray
 _BINS, _BEYOND = 640, 0.6
 #: Share of the light of lit rows from which a row counts as lit.
 _LIT_SHARE = 0.18
-#: Share of missing height below which the light is taken for the whole screen.
-_WHOLE = 0.07
+#: Share of missing height below which the light is taken for the whole screen; share of the light that is nearly all.
+_WHOLE, _NEARLY_ALL = 0.07, 0.98
+#: Focal length of a camera that no profile describes, picture widths.
+_FOCAL_WIDTHS = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ class Plane:
         the columns is at right angles to both.
         """
         u0, a, b, g, h, _ = grid.numbers
-        focal = SETTINGS.focal_widths if grid.lens is None else grid.lens.camera_matrix[0, 0] / grid.width
+        focal = _FOCAL_WIDTHS if grid.lens is None else grid.lens.camera_matrix[0, 0] / grid.width
         depth = np.array([g * focal, h * focal, 1.0])
         normal = depth / np.linalg.norm(depth)
         across = np.array([(u0 * g + a) * focal, (u0 * h + b) * focal, u0])
@@ -116,7 +117,7 @@ def lit_range(v: FloatArray, light: FloatArray, longest: float = 1.0) -> tuple[f
     if end - start > n:
         # The band pass smears light beyond both ends: use the middle of the positions that hold nearly all of it.
         held = gain[n:] - gain[:-n]
-        start = round(float(np.flatnonzero(held > SETTINGS.nearly_all * held.max()).mean()))
+        start = round(float(np.flatnonzero(held > _NEARLY_ALL * held.max()).mean()))
         end = start + n
     return float(v[0] + (start - 0.5) * step), float(v[0] + (end - 0.5) * step)
 
