@@ -9,7 +9,7 @@ proposes outlines with log-odds and leaves the decision to the search.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -248,21 +248,20 @@ def _stands_out(strips: Strips, grid: Grid) -> bool:
 def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> list[OutlineCandidate]:
     """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
     light, profile = _light_across(strips, grid, layouts[0].sigma)
-    starts = [first_columns(profile, layout.n_columns) for layout in layouts]
-    odds = np.concatenate([start.log_odds for start in starts])
-    likeliest = float(odds.max())
     found: list[OutlineCandidate] = []
-    for layout, start in zip(layouts, starts, strict=True):
-        likely = np.flatnonzero(start.log_odds > start.log_odds.max() + _MIN_LOG_ODDS)
-        best = int(start.columns[start.log_odds.argmax()])
-        own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, _LAST_STEPS, n_columns=layout.n_columns)
-        plane, ends, has_bars = find_rows(strips, light, own, layout.n_columns, layout.aspect)
-        for number, log_odds in zip(start.columns[likely].tolist(), start.log_odds[likely].tolist(), strict=True):
-            corners = plane.corners(ends, number - best)
-            lit = (profile.ends[0] - number, number + layout.n_columns - profile.ends[1])
-            unlit = _unlit_sides(corners, lit, has_bars, (strips.width, strips.height))
-            counted, odds_lost = own.shifted(number - best), log_odds - likeliest
-            found.append(OutlineCandidate(corners, strips, counted, layout, odds_lost, start.fills, unlit))
+    for layout in layouts:
+        columns, odds, fills = first_columns(profile, layout.n_columns)
+        best, n = int(columns[odds.argmax()]), layout.n_columns
+        own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, _LAST_STEPS, n_columns=n)
+        plane, ends, has_bars = find_rows(strips, light, own, n, layout.aspect)
+        for number, log_odds in zip(columns.tolist(), odds.tolist(), strict=True):
+            if log_odds > odds.max() + _MIN_LOG_ODDS:
+                corners, counted = plane.corners(ends, number - best), own.shifted(number - best)
+                unlit = (profile.ends[0] - number, number + n - profile.ends[1])
+                sides = _unlit_sides(corners, unlit, has_bars, (strips.width, strips.height))
+                found.append(OutlineCandidate(corners, strips, counted, layout, log_odds, fills, sides))
+    likeliest = max(candidate.log_odds for candidate in found)
+    found = [replace(candidate, log_odds=candidate.log_odds - likeliest) for candidate in found]
     return sorted(found, key=lambda candidate: -candidate.log_odds)
 
 

@@ -287,17 +287,17 @@ def test_a_film_has_sharp_ends_and_fading_light_has_none() -> None:
     (film,) = profile_of("film").spans
     np.testing.assert_allclose(film, (2.6, 17.4), atol=0.3)
     assert not profile_of("fading").spans
-    start = first_columns(profile_of("film"), 20)
-    assert start.columns[start.log_odds.argmax()] == 0
+    columns, log_odds, _ = first_columns(profile_of("film"), 20)
+    assert columns[log_odds.argmax()] == 0
 
 
 @pytest.mark.parametrize("film", [(0.8, 19.2), (0.6, 18.4)])
 def test_narrow_bars_on_both_sides_show_the_first_column(film: tuple[float, float]) -> None:
     place = (np.arange(-16, 22 * 8) + 0.5) / 8
     light = np.where((place > 1.5) & (place < 18.5), 2.0, 0.0)
-    start = first_columns(LightProfile(place, np.ones(place.size, bool), light, (film,)), 20)
-    in_doubt = (start.log_odds > start.log_odds.max() - 2).sum() > 1
-    assert start.columns[start.log_odds.argmax()] == 0 or in_doubt
+    columns, log_odds, _ = first_columns(LightProfile(place, np.ones(place.size, bool), light, (film,)), 20)
+    in_doubt = (log_odds > log_odds.max() - 2).sum() > 1
+    assert columns[log_odds.argmax()] == 0 or in_doubt
     assert in_doubt == (sum(film) != 20)
 
 
@@ -314,9 +314,9 @@ def test_steady_light_around_the_screen_shows_the_first_column() -> None:
 def test_light_that_ends_just_before_the_edge_of_the_picture_ends_on_the_screen() -> None:
     place = (np.arange(-8, 20 * 8 + 3) + 0.5) / 8
     light = np.where((place > 7) & (place < 20), 1.3, -0.1)
-    start = first_columns(LightProfile(place, np.ones(place.size, bool), light, ()), 20)
-    assert start.columns[start.log_odds.argmax()] == 0
-    assert not start.fills
+    columns, log_odds, fills = first_columns(LightProfile(place, np.ones(place.size, bool), light, ()), 20)
+    assert columns[log_odds.argmax()] == 0
+    assert not fills
 
 
 def test_light_ends_where_bars_begin_and_takes_no_more_than_a_screen() -> None:
