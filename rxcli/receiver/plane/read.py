@@ -83,6 +83,8 @@ def cells_of(band: NDArray[Any], cell_px: int) -> NDArray[Any]:
 
 
 def _read_mosaic(frame: Frame, mosaic: Mosaic) -> LightPlane:
+    import cv2
+
     height, width = frame.pixels.shape
     weights, offsets, is_complete = _mosaic_weights(mosaic)
     period, n_colours = weights.shape
@@ -96,7 +98,7 @@ def _read_mosaic(frame: Frame, mosaic: Mosaic) -> LightPlane:
             runs = frame.pixels[rows, : n_cells * cell_px].astype(np.float32).reshape(-1, n_cells, cell_px)
             sums[1:, rows] = (runs @ weights[phase] - offsets[phase] * np.float32(cell_px)).T
     if not is_complete:
-        sums = _smooth_rows(sums)
+        sums = np.asarray(cv2.filter2D(sums, -1, np.array([[0.25, 0.5, 0.25]], np.float32)))
     return LightPlane(_run(sums), cell_px, width, 0.0, 1.0, is_linear=True)
 
 
@@ -117,10 +119,3 @@ def _mosaic_weights(mosaic: Mosaic) -> tuple[Float32Array, Float32Array, bool]:
     weights = share[np.arange(pattern.shape[0])[:, None], pattern] / (mosaic.white - black.mean())
     offsets = (weights * black[pattern]).mean(axis=1)
     return weights.astype(np.float32), offsets.astype(np.float32), complete
-
-
-def _smooth_rows(values: Float32Array) -> Float32Array:
-    import cv2
-
-    kernel, alone = np.array([0.25, 0.5, 0.25], np.float32), np.ones(1, np.float32)
-    return np.asarray(cv2.sepFilter2D(values, -1, kernel, alone, borderType=cv2.BORDER_REFLECT_101), np.float32)

@@ -67,7 +67,9 @@ def corners_by_slots(
         normal = (slopes * weight.ravel()) @ slopes.T + np.diag(prior)
         gradient = slopes @ (weight * off).ravel() - prior * (numbers - start.numbers)
         numbers = numbers + np.linalg.solve(normal, gradient)
-    return _corners(replace(start, numbers=numbers), corners, n_columns, aspect)
+    # The middle of the screen stays on its row, and the screen as high as it was.
+    plane = Plane.through(replace(start, numbers=numbers), n_columns, aspect, float(corners[:, 1].mean()))
+    return plane.corners(plane.ends_of(corners))
 
 
 def _start(strips: Strips, corners: FloatArray, n_columns: int, lens: Lens | None) -> Grid:
@@ -107,9 +109,3 @@ def _waves(
     # The row noise is projected off the strips, so it is projected off the waves.
     changes = changes - np.einsum("wcr,wr->wc", changes, noise)[..., None] * noise[:, None]
     return np.asarray(np.where(np.abs(changes) < _MIN_WAVE, 0, changes), np.float32)
-
-
-def _corners(grid: Grid, before: FloatArray, n_columns: int, aspect: float) -> FloatArray:
-    """Corners on the outer borders of a grid; top and bottom at right angles to its columns, as high as they were."""
-    plane = Plane.through(grid, n_columns, aspect, float(before[:, 1].mean()))
-    return plane.corners(plane.ends_of(before))

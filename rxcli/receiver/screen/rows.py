@@ -64,12 +64,9 @@ class Plane:
     def pixels(self, points: FloatArray) -> FloatArray:
         """(n, 2) pixels of (n, 2) columns and v."""
         u0, a, b, g, h, _ = self.grid.numbers
-        u, v = points[:, 0] - u0, points[:, 1]
-        matrix = np.empty((len(points), 2, 2))
-        matrix[:, 0, 0], matrix[:, 0, 1] = a - u * g, b - u * h
-        matrix[:, 1, 0], matrix[:, 1, 1] = self.c - v * g, self.d - v * h
-        right = np.stack([u, v - self.v0], axis=-1)
-        return self.grid.pixels_of(np.linalg.solve(matrix, right[..., None])[..., 0])
+        to_plane = np.linalg.inv([[a, b, 0], [self.c, self.d, self.v0], [g, h, 1]])
+        x, y, scale = to_plane @ np.stack([points[:, 0] - u0, points[:, 1], np.ones(len(points))])
+        return self.grid.pixels_of(np.stack([x / scale, y / scale], axis=-1))
 
     def corners(self, ends: tuple[float, float], first_column: int = 0) -> FloatArray:
         """(4, 2) corners, pixels, clockwise from the top left, of the screen between two v from `first_column` on."""
@@ -106,12 +103,12 @@ def find_rows(
     return plane, (bottom - 1, top + 1), False
 
 
-def lit_range(v: FloatArray, light: FloatArray, longest: float = 1.0) -> tuple[float, float]:
-    """Beginning and end of the light, at most `longest` apart."""
+def lit_range(v: FloatArray, light: FloatArray) -> tuple[float, float]:
+    """Beginning and end of the light, at most one screen apart."""
     step = float(v[1] - v[0])
     full = max(float(np.percentile(light[light != 0], 75)), TINY) if light.any() else TINY
     gain = np.concatenate([[0.0], np.cumsum(np.minimum(light, full) - _LIT_SHARE * full)])
-    n = min(round(longest / step), light.size)
+    n = min(round(1 / step), light.size)
     end = int((gain - np.minimum.accumulate(gain)).argmax())
     start = int(gain[: end + 1].argmin())
     if end - start > n:

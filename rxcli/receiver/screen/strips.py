@@ -9,7 +9,7 @@ fifth of the picture's width has finer strips and its own blocks; everything aft
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from rxcli.numerics import TINY
 from rxcli.receiver.screen import geometry
 from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
-_Real = TypeVar("_Real", np.float32, np.float64)
 #: Strips across the picture, and across each part of a picture with narrow columns; windows of rows.
 _N_STRIPS, _N_PART_STRIPS, _N_WINDOWS = 200, 150, 16
 #: Rows that are averaged, as a share of the lag at which the correlation of neighbouring strips falls to half its value
@@ -138,22 +137,17 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
     points = np.stack(np.meshgrid(x, middles), axis=-1)
     changes, lit, noise = _without_row_noise(_windows(_band_passed(light, means, short), n_windows))
 
-    def parted(values: NDArray[_Real]) -> NDArray[_Real]:
+    def parted(values: NDArray[Any]) -> NDArray[Any]:
         """(W, S, ...) as (parts x W, S / parts, ...)."""
         split = values.reshape(n_windows, n_parts, -1, *values.shape[2:])
         return np.ascontiguousarray(np.moveaxis(split, 1, 0)).reshape(n_parts * n_windows, -1, *values.shape[2:])
 
     stored, flat = (flat_places(points, plane.width, plane.height, model) for model in (None, lens))
-    raw_x, raw_y, x_flat, y_flat = (parted(values) for values in (*stored, *flat))
+    by_window = means.reshape(x.size, n_windows, rows)
+    level, darkest = by_window.mean(axis=2).T, _roughly_linear(plane, by_window.min(axis=2).T)
+    of_strips = zip(_OF_STRIPS, (changes, lit, level, darkest, *stored, *flat), strict=True)
     return Strips(
-        parted(changes),
-        parted(lit),
-        parted(means.reshape(x.size, n_windows, rows).mean(axis=2).T),
-        parted(_roughly_linear(plane, means.reshape(x.size, n_windows, rows).min(axis=2).T)),
-        raw_x,
-        raw_y,
-        x_flat,
-        y_flat,
+        **{name: parted(values) for name, values in of_strips},
         half_height=rows * short / 2 / plane.width,
         row_noise=noise,
         short_rows=short,
