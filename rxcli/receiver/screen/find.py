@@ -197,14 +197,9 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
 
 
 def shows_columns(plane: LightPlane, sigma: float) -> bool:
-    """Whether the strongest comb of wide columns in a picture stands out."""
+    """Whether a picture has a grid of wide columns."""
     strips = _strips_of(plane)
-    combs = [] if strips is None else find_combs(strips, sigma)
-    if strips is None or not combs:
-        return False
-    some = strips.blocks(slice(None, None, 2))
-    grid = moved_by_waveforms(some, grid_of_comb(combs[0], strips), sigma, _FIRST_STEPS)
-    return _stands_out(some, with_light(some, grid, sigma))
+    return strips is not None and wide_grid(strips, sigma) is not None
 
 
 def _score(grid: Grid) -> float:
