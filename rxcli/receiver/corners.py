@@ -144,7 +144,7 @@ def whole_picture(frame: Frame) -> FloatArray:
 def turned_pixels(frame: Frame, options: ReceiverOptions, timer: Timer) -> str | None:
     """Message about a picture that was rotated by 90 degrees, or None. Of a clip only the first frame is examined."""
     wide = [layout for layout in layouts_of(options) if not layout.is_narrow]
-    if frame.index or not wide or not find.shows_columns(turned(timer.planes.plane(frame)), wide[0].sigma):
+    if frame.index or not find.find_screens(turned(timer.planes.plane(frame)), wide):
         return None
     return (
         "the picture was turned by 90 degrees after it was taken, or taken in portrait: its stripes run downwards; use "

@@ -25,8 +25,8 @@ from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
 #: The next step where a picture is too dark.
 BRIGHTEN = "expose longer, raise ISO, or show a brighter picture on the screen"
-#: Minimum width and height of a picture, pixels, and minimum number of strips across it.
-MIN_SIZE_PX, _MIN_STRIPS = 96, 120
+#: Minimum width and height of a picture, pixels.
+MIN_SIZE_PX = 96
 #: Number of columns from which a screen's columns count as narrow, and parts of a picture that are searched for them.
 _NARROW_COLUMNS, _PARTS = 50, 5
 #: Factor by which the followed width of a grid of narrow columns grows at a time.
@@ -91,9 +91,9 @@ def find_screens(
         bright: corners (4, 2) of the bright part of the picture, clockwise from its top left, where borders of columns
             are looked for as well.
     """
-    strips = _strips_of(plane, lens)
-    if strips is None:
+    if min(plane.width, plane.height) < MIN_SIZE_PX:
         return []
+    strips = read_strips(plane, lens)
     narrow, wide = ([layout for layout in layouts if layout.is_narrow is many] for many in (True, False))
     screens = _screens_apart(strips, wide) if wide else []
     if screens:
@@ -109,14 +109,6 @@ def find_screens(
     rival = None if bright is None else grid_between(bright, wide[0].n_columns, size, lens)
     grid = wide_grid(strips, wide[0].sigma, rival)
     return [] if grid is None else [_numbered(strips, grid, wide)]
-
-
-def _strips_of(plane: LightPlane, lens: Lens | None = None) -> Strips | None:
-    """Strips of a picture, or None if it is too small."""
-    if min(plane.width, plane.height) < MIN_SIZE_PX:
-        return None
-    strips = read_strips(plane, lens)
-    return strips if strips.lit.shape[1] >= _MIN_STRIPS else None
 
 
 def _screens_apart(strips: Strips, layouts: Sequence[ColumnLayout]) -> list[list[OutlineCandidate]]:
@@ -194,12 +186,6 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
     moved = [moved_by_waveforms(strips, grid, sigma, _LAST_STEPS) for grid in starts]
     settled = [with_light(strips, grid, sigma) for grid in moved]
     return max((grid for grid in settled if _stands_out(strips, grid)), key=_score, default=None)
-
-
-def shows_columns(plane: LightPlane, sigma: float) -> bool:
-    """Whether a picture has a grid of wide columns."""
-    strips = _strips_of(plane)
-    return strips is not None and wide_grid(strips, sigma) is not None
 
 
 def _score(grid: Grid) -> float:

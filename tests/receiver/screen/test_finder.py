@@ -19,7 +19,6 @@ from rxcli.receiver.screen.find import (
     OutlineCandidate,
     find_screens,
     follow_outline,
-    shows_columns,
     why_useless,
     wide_grid,
 )
@@ -376,10 +375,10 @@ def test_wide_columns_are_not_taken_for_narrow_ones() -> None:
 
 
 def test_plain_columns_are_told_from_none() -> None:
-    assert shows_columns(drawn("film"), WIDE.sigma)
+    assert find_screens(drawn("film"), [WIDE])
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
-    assert not shows_columns(plane_of(noise), WIDE.sigma)
-    assert not shows_columns(plane_of(noise[:16, :16]), WIDE.sigma)
+    assert not find_screens(plane_of(noise), [WIDE])
+    assert not find_screens(plane_of(noise[:16, :16]), [WIDE])
 
 
 def test_a_screen_that_moved_a_little_is_followed_and_a_lost_one_is_noticed() -> None:
