@@ -133,9 +133,13 @@ def _noise_model(plane: LightPlane, sums: Float32Array, part_px: int, tone: str)
 
 
 def _floor_and_slope(x: NDArray[np.floating], y: NDArray[np.floating]) -> tuple[float, float]:
-    """Line through bins of light and variance: the median slope of all pairs (Theil and Sen), at least zero."""
+    """Line through bins of light and variance: slope by a median over pairs, weighted by their distance."""
     run, rise = x[:, None] - x, y[:, None] - y
     is_distinct = run > 1e-4
-    slope = max(float(np.median(rise[is_distinct] / run[is_distinct])), 0.0) if is_distinct.any() else 0.0
+    slopes, weights = rise[is_distinct] / run[is_distinct], run[is_distinct]
+    order = np.argsort(slopes)
+    reached = np.cumsum(weights[order])
+    slope = float(slopes[order[np.searchsorted(reached, reached[-1] / 2)]]) if order.size else 0.0
+    slope = max(slope, 0.0)
     dark = slice(0, max(1, y.size // 4))
     return float(max((y[dark] - slope * x[dark]).mean(), 1e-10)), slope
