@@ -11,17 +11,8 @@ from rxcli.profiles import ScreenProfile
 from rxcli.receiver.cameras import known_lens
 from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
 from rxcli.receiver.plane import turned
-from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen import find, geometry
 from rxcli.receiver.screen.bright import bright_quadrilateral
-from rxcli.receiver.screen.find import (
-    BRIGHTEN,
-    ColumnLayout,
-    OutlineCandidate,
-    find_screens,
-    shows_columns,
-    thinned,
-    why_useless,
-)
 from rxcli.receiver.settings import SETTINGS
 from rxcli.types import FloatArray, Frame
 
@@ -63,10 +54,10 @@ def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
     with timer("geometry"):
         plane = timer.planes.plane(frame)
         bright = bright_quadrilateral(plane)
-        screens = find_screens(plane, layouts, known_lens(frame, options), bright)
+        screens = find.find_screens(plane, layouts, known_lens(frame, options), bright)
     single_wide = sum(not layout.is_narrow for layout in layouts) == 1
 
-    def outline(candidate: OutlineCandidate) -> Outline:
+    def outline(candidate: find.OutlineCandidate) -> Outline:
         is_usual = single_wide and not candidate.layout.is_narrow
         found = Outline(
             candidate.corners,
@@ -90,12 +81,10 @@ def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
     return outlines
 
 
-def layouts_of(options: ReceiverOptions) -> list[ColumnLayout]:
+def layouts_of(options: ReceiverOptions) -> list[find.ColumnLayout]:
     """Column layouts of the screen profiles, in ascending order of columns."""
-    layouts = {
-        screen.columns: ColumnLayout(screen.columns, screen.light_spread, screen.aspect) for screen in options.screens
-    }
-    return [layouts[n] for n in sorted(layouts)]
+    by_columns = {screen.columns: screen for screen in options.screens}
+    return [find.ColumnLayout(n, by_columns[n].light_spread, by_columns[n].aspect) for n in sorted(by_columns)]
 
 
 def _as_viewed(outline: Outline, orientation: int) -> Outline:
@@ -155,7 +144,7 @@ def whole_picture(frame: Frame) -> FloatArray:
 def turned_pixels(frame: Frame, options: ReceiverOptions, timer: Timer) -> str | None:
     """Message about a picture that was rotated by 90 degrees, or None. Of a clip only the first frame is examined."""
     wide = [layout for layout in layouts_of(options) if not layout.is_narrow]
-    if frame.index or not wide or not shows_columns(turned(timer.planes.plane(frame)), wide[0].sigma):
+    if frame.index or not find.find_screens(turned(timer.planes.plane(frame)), wide):
         return None
     return (
         "the picture was turned by 90 degrees after it was taken, or taken in portrait: its stripes run downwards; use "
@@ -167,10 +156,10 @@ def reason_for_none(frame: Frame) -> str:
     """Why no screen was found in a frame, and what to do."""
     levels = frame.mosaic
     black, white = (frame.black, frame.white) if levels is None else (float(np.mean(levels.black)), levels.white)
-    useless = why_useless(frame.pixels, black, white)
-    mean = float(thinned(frame.pixels, black, white).mean())
+    useless = find.why_useless(frame.pixels, black, white)
+    mean = float(find.thinned(frame.pixels, black, white).mean())
     if useless is None and mean < SETTINGS.dark_mean:
-        return f"{_NO_COLUMNS}, and it is dark ({max(100 * mean, 0):.0f} % of white on average); {BRIGHTEN}"
+        return f"{_NO_COLUMNS}, and it is dark ({max(100 * mean, 0):.0f} % of white on average); {find.BRIGHTEN}"
     return "; ".join(useless or (_NO_COLUMNS, _SHOW_COLUMNS))
 
 

@@ -25,11 +25,10 @@ def column_map(frame: Frame) -> dict[str, Any] | None:
     from rxcli.receiver.corners import layouts_of
     from rxcli.receiver.plane import read_plane
     from rxcli.receiver.screen.bright import bright_quadrilateral
-    from rxcli.receiver.screen.find import find_screens
-    from rxcli.receiver.screen.settings import SETTINGS
+    from rxcli.receiver.screen.find import MIN_SIZE_PX, find_screens
     from rxcli.receiver.screen.strips import read_strips
 
-    if min(frame.width, frame.height) < SETTINGS.min_size_px:
+    if min(frame.width, frame.height) < MIN_SIZE_PX:
         return None
     plane = read_plane(frame)
     screens = find_screens(plane, layouts_of(ReceiverOptions()), bright=bright_quadrilateral(plane))

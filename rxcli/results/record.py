@@ -74,7 +74,7 @@ def _numbering(result: FrameResult) -> dict[str, Any]:
     certainty = _rounded(result.column_certainty, 4)
     return {
         **({"inferred_sides": list(result.inferred_sides)} if result.inferred_sides else {}),
-        **({"column_certainty": certainty} if result.column_certainty < 1 else {}),
+        **({"column_certainty": certainty} if certainty != 1 else {}),
         **({"column_offset": None} if result.column_offset is None else {}),
         **({"mirrored": result.mirrored} if result.mirrored is not False else {}),
     }

@@ -46,11 +46,10 @@ class CameraSettings:
 
     #: Slots over which the picture is taken as constant.
     picture_slots: float = 25.0
-    #: Fits at most; slots by which a fit moves the clock, anywhere, from which on a frame with plain packets is
-    #: received with it again; and the share of the evidence that must stay.
+    #: Fits at most, and slots by which a fit moves the clock, anywhere, from which on a frame with plain packets is
+    #: received with it again.
     max_fits: int = 2
     matters_slots: float = 0.2
-    kept_evidence: float = 0.9
     #: Steps of the fit, and how far the last one may move any row, slots.
     settle_steps: int = 4
     converged_slots: float = 0.03

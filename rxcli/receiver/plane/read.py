@@ -17,9 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.receiver.plane.settings import SETTINGS
 from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
 
+#: Minimum number of cells of a row, several for every strip of a hundred columns; and of a picture rotated by 90
+#: degrees, which is searched for wide columns only.
+_MIN_CELLS, _TURNED_CELLS = 1500, 400
 #: Rows read at a time, chosen to fit the processor's cache.
 BAND_ROWS = 64
 
@@ -43,7 +45,7 @@ def turned(plane: LightPlane) -> LightPlane:
     import cv2
 
     cells = np.diff(plane.sums, axis=0)
-    cell_px = max(cells.shape[1] // plane.cell_px // SETTINGS.turned_cells, 1)
+    cell_px = max(cells.shape[1] // plane.cell_px // _TURNED_CELLS, 1)
     n = cells.shape[1] // (cell_px * plane.cell_px)
     rows = cells[:, : n * cell_px * plane.cell_px]
     sums = np.zeros((n + 1, len(cells)), np.float32)
@@ -55,7 +57,7 @@ def turned(plane: LightPlane) -> LightPlane:
 def _cell_px(width: int, period: int) -> int:
     """Width of a cell: the largest period times a power of two that leaves at least `min_cells` cells."""
     cell_px = period
-    while width // (2 * cell_px) >= SETTINGS.min_cells:
+    while width // (2 * cell_px) >= _MIN_CELLS:
         cell_px *= 2
     return cell_px
 
@@ -81,6 +83,8 @@ def cells_of(band: NDArray[Any], cell_px: int) -> NDArray[Any]:
 
 
 def _read_mosaic(frame: Frame, mosaic: Mosaic) -> LightPlane:
+    import cv2
+
     height, width = frame.pixels.shape
     weights, offsets, is_complete = _mosaic_weights(mosaic)
     period, n_colours = weights.shape
@@ -94,7 +98,7 @@ def _read_mosaic(frame: Frame, mosaic: Mosaic) -> LightPlane:
             runs = frame.pixels[rows, : n_cells * cell_px].astype(np.float32).reshape(-1, n_cells, cell_px)
             sums[1:, rows] = (runs @ weights[phase] - offsets[phase] * np.float32(cell_px)).T
     if not is_complete:
-        sums = _smooth_rows(sums)
+        sums = np.asarray(cv2.filter2D(sums, -1, np.array([[0.25, 0.5, 0.25]], np.float32)))
     return LightPlane(_run(sums), cell_px, width, 0.0, 1.0, is_linear=True)
 
 
@@ -115,10 +119,3 @@ def _mosaic_weights(mosaic: Mosaic) -> tuple[Float32Array, Float32Array, bool]:
     weights = share[np.arange(pattern.shape[0])[:, None], pattern] / (mosaic.white - black.mean())
     offsets = (weights * black[pattern]).mean(axis=1)
     return weights.astype(np.float32), offsets.astype(np.float32), complete
-
-
-def _smooth_rows(values: Float32Array) -> Float32Array:
-    import cv2
-
-    kernel, alone = np.array([0.25, 0.5, 0.25], np.float32), np.ones(1, np.float32)
-    return np.asarray(cv2.sepFilter2D(values, -1, kernel, alone, borderType=cv2.BORDER_REFLECT_101), np.float32)

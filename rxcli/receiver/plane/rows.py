@@ -12,16 +12,24 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.receiver.plane.settings import SETTINGS
 from rxcli.types import Float32Array, FloatArray, LightPlane, Outlines, RowProfiles
 
+#: Width of a strip in pixels from which a column is divided further, and maximum number of strips of a column.
+_STRIP_PX, _MAX_STRIPS = 12, 8
+#: The noise model compares neighbouring parts of a strip, because denoising correlates neighbouring pixels: parts per
+#: strip, rows it is fitted to, and bins of equal light.
+_PARTS_PER_STRIP, _NOISE_ROWS, _NOISE_BINS = 4, 20, 24
+#: Row spacing at which the pixels of a strip are counted.
+_COUNT_ROW_STEP = 16
+#: Minimum distance of two edges, in cells, at which light is measured between them.
+_MIN_ENCLOSED = 0.02
 #: Steps of a tone curve's table.
 _TONE_STEPS = 1 << 16
 
 
 def strips_per_column(column_px: float) -> int:
     """Lateral strips for columns of `column_px` pixels."""
-    return int(np.clip(column_px // SETTINGS.strip_px, 1, SETTINGS.max_strips))
+    return int(np.clip(column_px // _STRIP_PX, 1, _MAX_STRIPS))
 
 
 def tone_to_light(tone: str, encoded: FloatArray) -> FloatArray:
@@ -52,13 +60,13 @@ def sample_rows(plane: LightPlane, outlines: Outlines, tone: str) -> RowProfiles
     light = np.diff(_sums_at(plane.sums, edges, int(outlines.rows[0])), axis=0)
     widths = np.diff(edges, axis=0) * np.float32(plane.cell_px)
     enclosed = np.abs(widths)
-    widths[enclosed <= SETTINGS.min_enclosed * plane.cell_px] = np.inf
+    widths[enclosed <= _MIN_ENCLOSED * plane.cell_px] = np.inf
     light /= widths
     inside = outlines.inside
     light = _light_of(plane, light, tone).reshape(inside.shape)
     light *= inside
-    count = np.median(enclosed[:, :: SETTINGS.count_row_step], axis=1)
-    cells = max(int(np.median(count) / (SETTINGS.parts_per_strip * plane.cell_px)), 1)
+    count = np.median(enclosed[:, ::_COUNT_ROW_STEP], axis=1)
+    cells = max(int(np.median(count) / (_PARTS_PER_STRIP * plane.cell_px)), 1)
     rows = slice(int(outlines.rows[0]), int(outlines.rows[-1]) + 1)
     sums = plane.sums[int(edges.min()) : int(edges.max()) + 2 : cells, rows]
     noise_floor, noise_slope = _noise_model(plane, sums, cells * plane.cell_px, tone)
@@ -109,13 +117,13 @@ def _noise_model(plane: LightPlane, sums: Float32Array, part_px: int, tone: str)
     Medians over bins of equal light ignore the picture's edges. The model is a straight line through the bins, with
     floor and slope at least zero.
     """
-    every = max(sums.shape[1] // SETTINGS.noise_rows, 1)
+    every = max(sums.shape[1] // _NOISE_ROWS, 1)
     parts = _light_of(plane, np.diff(sums[:, every // 2 :: every], axis=0) / np.float32(part_px), tone)
     if parts.shape[0] < 2:
         return 1e-6 * part_px, 0.0
     difference = np.abs(np.diff(parts, axis=0)).ravel()
     light = ((parts[1:] + parts[:-1]) / 2).ravel()
-    n_bins = min(SETTINGS.noise_bins, max(1, light.size // 50))
+    n_bins = min(_NOISE_BINS, max(1, light.size // 50))
     # Bins of equal counts; the few brightest samples left over do not matter.
     bins = np.argsort(light)[: light.size // n_bins * n_bins].reshape(n_bins, -1)
     x = np.median(light[bins], axis=1)

@@ -16,10 +16,18 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen.grid import Grid, grid_through
-from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import Float32Array, FloatArray
 
+#: Columns across the picture, or across a fifth of it, and their step; minimum number of strips per column.
+_MIN_PITCH, _MAX_PITCH, _PITCH_STEP, _MIN_COLUMN_STRIPS = 9.0, 46.0, 0.4, 4.0
+#: Maximum turn and maximum changes of pitch across and along the columns, as shares of the pitch; step of all three at
+#: a corner of the picture, columns.
+_MAX_TURN, _MAX_ACROSS, _MAX_ALONG, _CORNER_STEP = 0.12, 0.2, 0.3, 0.4
+#: Distance of the pairs of strips that show the comb of borders best, columns.
+_PAIR_DISTANCE = 0.72
+#: Combs that are tried as grids, and minimum height of a comb, standard deviations by chance.
+_N_COMBS, _MIN_COMB = 8, 6.0
 #: Combs whose pitch and whose position at the picture's ends differ by less lead to the same grid; columns.
 _SAME_PITCH, _SAME_SHAPE = 0.7, 0.8
 
@@ -65,9 +73,9 @@ def find_combs(strips: Strips, sigma: float) -> list[Comb]:
     for comb in sorted(_all_combs(strips.without_common_light(), sigma), key=lambda comb: -comb.score):
         if not any(comb.is_like(earlier) for earlier in chosen):
             chosen.append(comb)
-        if len(chosen) == SETTINGS.n_combs or chosen[0].score <= SETTINGS.min_comb:
+        if len(chosen) == _N_COMBS or chosen[0].score <= _MIN_COMB:
             break
-    return [comb for comb in chosen if chosen[0].score > SETTINGS.min_comb]
+    return [comb for comb in chosen if chosen[0].score > _MIN_COMB]
 
 
 def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
@@ -84,9 +92,9 @@ def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
 def _all_combs(strips: Strips, sigma: float) -> list[Comb]:
     """The best comb of each pitch."""
     step = strips.step * strips.n_parts
-    max_pitch = min(SETTINGS.max_pitch, 1 / (SETTINGS.min_column_strips * step))
-    pitches = np.arange(SETTINGS.min_pitch, max_pitch, SETTINGS.pitch_step)
-    distances = np.maximum(np.round(SETTINGS.pair_distance / (pitches * step)), 1).astype(np.int64)
+    max_pitch = min(_MAX_PITCH, 1 / (_MIN_COLUMN_STRIPS * step))
+    pitches = np.arange(_MIN_PITCH, max_pitch, _PITCH_STEP)
+    distances = np.maximum(np.round(_PAIR_DISTANCE / (pitches * step)), 1).astype(np.int64)
     y = strips.raw_y.mean(axis=1) * strips.n_parts
     found: list[Comb] = []
     for distance in np.unique(distances).tolist():
@@ -104,19 +112,19 @@ def _all_combs(strips: Strips, sigma: float) -> list[Comb]:
 
 def _range(largest: float, at_corner: float) -> FloatArray:
     """Values from `-largest` to `largest`, including 0, in steps that move a corner by the corner's step at most."""
-    n = int(np.ceil(largest * at_corner / SETTINGS.corner_step))
+    n = int(np.ceil(largest * at_corner / _CORNER_STEP))
     return np.linspace(-largest, largest, 2 * n + 1)
 
 
 def _best_combs(rest: Float32Array, step: float, y: FloatArray, pitches: FloatArray, n_parts: int) -> list[Comb]:
     """The best comb of each pitch, from values (W, n) of pairs of strips: sum along the strips, then over windows."""
     largest, half_x, half_y = float(pitches[-1]), 0.5, float(np.abs(y).max())
-    if SETTINGS.max_turn * largest * (y[1] - y[0]) < SETTINGS.corner_step and len(y) % 2 == 0:
+    if _MAX_TURN * largest * (y[1] - y[0]) < _CORNER_STEP and len(y) % 2 == 0:
         rest, y = rest[::2] + rest[1::2], (y[::2] + y[1::2]) / 2
-    turns = _range(SETTINGS.max_turn, largest * half_y)
-    across = _range(SETTINGS.max_across / n_parts, largest * half_x**2)
-    along = _range(SETTINGS.max_along / n_parts, largest * half_x * half_y)
-    spacing, reach = SETTINGS.pitch_step / 2, float(along.max()) * half_y * largest
+    turns = _range(_MAX_TURN, largest * half_y)
+    across = _range(_MAX_ACROSS / n_parts, largest * half_x**2)
+    along = _range(_MAX_ALONG / n_parts, largest * half_x * half_y)
+    spacing, reach = _PITCH_STEP / 2, float(along.max()) * half_y * largest
     start = int(np.floor((float(pitches[0]) - reach) / spacing))
     n_frequencies = int(np.ceil((largest + reach) / spacing)) - start + 1
     own = pitches[:, None, None] * (1 + along[:, None] * y)
@@ -139,7 +147,7 @@ def _best_combs(rest: Float32Array, step: float, y: FloatArray, pitches: FloatAr
 def _waves(n: int, step: float, start: int, n_frequencies: int) -> NDArray[np.complex64]:
     """(n, F) complex waves at pairs of strips with spacing `step`, from the frequency with index `start` on."""
     x = (np.arange(n) - (n - 1) / 2) * step
-    return _turned(np.outer(x, (start + np.arange(n_frequencies)) * (SETTINGS.pitch_step / 2)))
+    return _turned(np.outer(x, (start + np.arange(n_frequencies)) * (_PITCH_STEP / 2)))
 
 
 def _turned(turns: FloatArray) -> NDArray[np.complex64]:

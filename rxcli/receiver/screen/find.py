@@ -9,7 +9,7 @@ proposes outlines with log-odds and leaves the decision to the search.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +19,25 @@ from rxcli.receiver.screen.combs import find_combs, grid_of_comb
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.rows import find_rows
-from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips, read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
 from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
 #: The next step where a picture is too dark.
 BRIGHTEN = "expose longer, raise ISO, or show a brighter picture on the screen"
-#: Parts of a picture that are searched for narrow columns.
-_PARTS = 5
+#: Minimum width and height of a picture, pixels.
+MIN_SIZE_PX = 96
+#: Number of columns from which a screen's columns count as narrow, and parts of a picture that are searched for them.
+_NARROW_COLUMNS, _PARTS = 50, 5
+#: Factor by which the followed width of a grid of narrow columns grows at a time.
+_REACH_GAIN = 1.4
+#: Steps of a grid on some of the windows, and last steps on all windows.
+_FIRST_STEPS, _LAST_STEPS = 3, 2
+#: Weight of the log-likelihood that borders add, relative to that of the light that waveforms explain; and the contrast
+#: of the strongest comb, as a share of the light it explains, from which no further combs are tried.
+_CONTRAST_WEIGHT, _PLAIN_CONTRAST = 1.5, 0.15
+#: Log-odds relative to the likeliest first column down to which another one is possible.
+_MIN_LOG_ODDS = -7.0
 #: JPEG codes blocks of pixels, whose borders look like those of narrow columns: their width, and its tolerance.
 _BLOCK_PX, _BLOCK_TOLERANCE_PX = 8.0, 0.1
 #: Number of unlit columns at a side from which the side counts as not visible.
@@ -47,7 +57,7 @@ class ColumnLayout:
     @property
     def is_narrow(self) -> bool:
         """Whether the columns are narrow, so that each fifth of a picture is searched for them."""
-        return self.n_columns >= SETTINGS.narrow_columns
+        return self.n_columns >= _NARROW_COLUMNS
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +91,9 @@ def find_screens(
         bright: corners (4, 2) of the bright part of the picture, clockwise from its top left, where borders of columns
             are looked for as well.
     """
-    strips = _strips_of(plane, lens)
-    if strips is None:
+    if min(plane.width, plane.height) < MIN_SIZE_PX:
         return []
+    strips = read_strips(plane, lens)
     narrow, wide = ([layout for layout in layouts if layout.is_narrow is many] for many in (True, False))
     screens = _screens_apart(strips, wide) if wide else []
     if screens:
@@ -101,14 +111,6 @@ def find_screens(
     return [] if grid is None else [_numbered(strips, grid, wide)]
 
 
-def _strips_of(plane: LightPlane, lens: Lens | None = None) -> Strips | None:
-    """Strips of a picture, or None if it is too small."""
-    if min(plane.width, plane.height) < SETTINGS.min_size_px:
-        return None
-    strips = read_strips(plane, lens)
-    return strips if strips.lit.shape[1] >= SETTINGS.min_strips else None
-
-
 def _screens_apart(strips: Strips, layouts: Sequence[ColumnLayout]) -> list[list[OutlineCandidate]]:
     """Candidate outlines of two screens side by side, or none: together they light more columns than one has."""
     sides = strips.sides_of_gap()
@@ -124,8 +126,8 @@ def _screens_apart(strips: Strips, layouts: Sequence[ColumnLayout]) -> list[list
 def why_useless(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white: float) -> tuple[str, str] | None:
     """Why a picture cannot show a screen at all and the next step, or None."""
     height, width = pixels.shape
-    if min(height, width) < SETTINGS.min_size_px:
-        min_px = SETTINGS.min_size_px
+    if min(height, width) < MIN_SIZE_PX:
+        min_px = MIN_SIZE_PX
         size = f"the picture has {width} x {height} pixels, a screen needs at least {min_px} each way"
         return size, "use the picture in its full size, not a thumbnail or a messenger's copy"
     sample = thinned(pixels, black, white)
@@ -150,11 +152,11 @@ def follow_outline(plane: LightPlane, corners: FloatArray, layout: ColumnLayout)
         corners: (4, 2) of the frame before, clockwise from the screen's top left in the stored picture.
         layout: of the screen's columns.
     """
-    if min(plane.width, plane.height) < SETTINGS.min_size_px:
+    if min(plane.width, plane.height) < MIN_SIZE_PX:
         return None
     strips = read_strips(plane, n_parts=_PARTS if layout.is_narrow else 1)
     n, start = layout.n_columns, grid_between(corners, layout.n_columns, (plane.width, plane.height), None)
-    grid = moved_by_waveforms(strips, start, layout.sigma, SETTINGS.first_steps + SETTINGS.last_steps)
+    grid = moved_by_waveforms(strips, start, layout.sigma, _FIRST_STEPS + _LAST_STEPS)
     grid = with_light(strips, grid, layout.sigma)
     if not _stands_out(strips, grid):
         return None
@@ -175,31 +177,20 @@ def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid |
     grids = (with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs)
     starts: list[Grid] = []
     if (strongest := next(grids, None)) is not None:
-        if strongest.contrast > SETTINGS.plain_contrast * strongest.explained:
-            strongest = moved_by_waveforms(some, strongest, sigma, SETTINGS.first_steps)
-            return moved_by_waveforms(strips, strongest, sigma, SETTINGS.last_steps)
+        if strongest.contrast > _PLAIN_CONTRAST * strongest.explained:
+            strongest = moved_by_waveforms(some, strongest, sigma, _FIRST_STEPS)
+            return moved_by_waveforms(strips, strongest, sigma, _LAST_STEPS)
         best = max([strongest, *grids], key=_score)
-        starts.append(moved_by_waveforms(some, best, sigma, SETTINGS.first_steps))
+        starts.append(moved_by_waveforms(some, best, sigma, _FIRST_STEPS))
     starts += [rival] if rival is not None and with_light(some, rival, sigma).contrast > 0 else []
-    moved = [moved_by_waveforms(strips, grid, sigma, SETTINGS.last_steps) for grid in starts]
+    moved = [moved_by_waveforms(strips, grid, sigma, _LAST_STEPS) for grid in starts]
     settled = [with_light(strips, grid, sigma) for grid in moved]
     return max((grid for grid in settled if _stands_out(strips, grid)), key=_score, default=None)
 
 
-def shows_columns(plane: LightPlane, sigma: float) -> bool:
-    """Whether the strongest comb of wide columns in a picture stands out."""
-    strips = _strips_of(plane)
-    combs = [] if strips is None else find_combs(strips, sigma)
-    if strips is None or not combs:
-        return False
-    some = strips.blocks(slice(None, None, 2))
-    grid = moved_by_waveforms(some, grid_of_comb(combs[0], strips), sigma, SETTINGS.first_steps)
-    return _stands_out(some, with_light(some, grid, sigma))
-
-
 def _score(grid: Grid) -> float:
     """Log-likelihood by which grids are compared."""
-    return grid.explained + SETTINGS.contrast_weight * grid.contrast
+    return grid.explained + _CONTRAST_WEIGHT * grid.contrast
 
 
 def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
@@ -208,7 +199,7 @@ def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
     for part in sorted(range(strips.n_parts), key=lambda part: abs(part - strips.n_parts // 2)):
         for comb in find_combs(strips.part(part), sigma)[:1]:
             own = few.part(part)
-            grid = moved_by_waveforms(own, grid_of_comb(comb, strips.part(part)), sigma, SETTINGS.first_steps)
+            grid = moved_by_waveforms(own, grid_of_comb(comb, strips.part(part)), sigma, _FIRST_STEPS)
             is_block = abs(grid.pitch_px - _BLOCK_PX) < _BLOCK_TOLERANCE_PX
             if is_block or not _stands_out(own, with_light(own, grid, sigma)):
                 continue
@@ -222,10 +213,10 @@ def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
     """Extend a grid from the part of a picture around `middle` to the whole width."""
     reach = 0.5 / _PARTS
     while reach < 0.5 + abs(middle):
-        reach *= SETTINGS.reach_gain
+        reach *= _REACH_GAIN
         within = np.abs(strips.raw_x - middle) < reach
         near = np.flatnonzero(within.any(axis=1))
-        grid = moved_by_waveforms(strips.blocks(near), grid, sigma, SETTINGS.last_steps, within[near])
+        grid = moved_by_waveforms(strips.blocks(near), grid, sigma, _LAST_STEPS, within[near])
     return grid
 
 
@@ -238,23 +229,20 @@ def _stands_out(strips: Strips, grid: Grid) -> bool:
 def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> list[OutlineCandidate]:
     """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
     light, profile = _light_across(strips, grid, layouts[0].sigma)
-    starts = [first_columns(profile, layout.n_columns) for layout in layouts]
-    odds = np.concatenate([start.log_odds for start in starts])
-    likeliest = float(odds.max())
     found: list[OutlineCandidate] = []
-    for layout, start in zip(layouts, starts, strict=True):
-        likely = np.flatnonzero(start.log_odds > start.log_odds.max() + SETTINGS.min_log_odds)
-        best = int(start.columns[start.log_odds.argmax()])
-        own = moved_by_waveforms(
-            strips, grid.shifted(best), layout.sigma, SETTINGS.last_steps, n_columns=layout.n_columns
-        )
-        plane, ends, has_bars = find_rows(strips, light, own, layout.n_columns, layout.aspect)
-        for number, log_odds in zip(start.columns[likely].tolist(), start.log_odds[likely].tolist(), strict=True):
-            corners = plane.corners(ends, number - best)
-            lit = (profile.ends[0] - number, number + layout.n_columns - profile.ends[1])
-            unlit = _unlit_sides(corners, lit, has_bars, (strips.width, strips.height))
-            counted, odds_lost = own.shifted(number - best), log_odds - likeliest
-            found.append(OutlineCandidate(corners, strips, counted, layout, odds_lost, start.fills, unlit))
+    for layout in layouts:
+        columns, odds, fills = first_columns(profile, layout.n_columns)
+        best, n = int(columns[odds.argmax()]), layout.n_columns
+        own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, _LAST_STEPS, n_columns=n)
+        plane, ends, has_bars = find_rows(strips, light, own, n, layout.aspect)
+        for number, log_odds in zip(columns.tolist(), odds.tolist(), strict=True):
+            if log_odds > odds.max() + _MIN_LOG_ODDS:
+                corners, counted = plane.corners(ends, number - best), own.shifted(number - best)
+                unlit = (profile.ends[0] - number, number + n - profile.ends[1])
+                sides = _unlit_sides(corners, unlit, has_bars, (strips.width, strips.height))
+                found.append(OutlineCandidate(corners, strips, counted, layout, log_odds, fills, sides))
+    likeliest = max(candidate.log_odds for candidate in found)
+    found = [replace(candidate, log_odds=candidate.log_odds - likeliest) for candidate in found]
     return sorted(found, key=lambda candidate: -candidate.log_odds)
 
 

@@ -11,7 +11,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import TINY
 from rxcli.profiles import LensModel
 from rxcli.types import Float32Array, FloatArray, IntArray, Lens, Outlines
 
@@ -154,10 +153,9 @@ def column_outlines(
     knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
     step = 1 if points[0, -1, 1] > points[0, 0, 1] else -1  # On a screen upside down y falls with v.
     y, x = points[:, ::step, 1], points[:, ::step, 0]
-    at_knots = np.broadcast_to(knots, (len(y), knots.size))
-    knot_x, knot_v = _interpolated(at_knots, y, x, np.broadcast_to(v[::step], y.shape))
-    edges_x = _between_knots(knot_x.astype(np.float32), knots, rows)
-    middle_v = _between_knots(((knot_v[1:] + knot_v[:-1]) / 2).astype(np.float32), knots, rows)
+    knot_x, knot_v = _interpolated(knots, y, x), _interpolated(knots, y, np.broadcast_to(v[::step], y.shape))
+    edges_x = _between_knots(knot_x.astype(np.float32), knots)
+    middle_v = _between_knots(((knot_v[1:] + knot_v[:-1]) / 2).astype(np.float32), knots)
     inside = (middle_v > 0) & (middle_v < 1)
     if knot_x.min() < 0 or knot_x.max() > width - 1:
         in_picture = (edges_x >= 0) & (edges_x <= width - 1)
@@ -165,7 +163,7 @@ def column_outlines(
     shape = (-1, n_strips, rows.size)
     sensor_row = None
     if lens is not None and lens.corrected:
-        sensor_row = _between_knots(_sensor_rows(knot_x, knots, lens), knots, rows).reshape(shape)
+        sensor_row = _between_knots(_sensor_rows(knot_x, knots, lens), knots).reshape(shape)
     return Outlines(rows, edges_x, inside.reshape(shape), sensor_row)
 
 
@@ -180,20 +178,9 @@ def _down_the_screen(u: FloatArray, corners: FloatArray, lens: Lens | None) -> t
     return screen_to_picture(np.stack(np.meshgrid(u, v, indexing="ij"), axis=-1), corners, lens), v
 
 
-def _interpolated(places: FloatArray | IntArray, known: FloatArray, *values: FloatArray) -> list[FloatArray]:
-    """Interpolate `values` (n, P each) from ascending `known` (n, P) linearly to the `places` (n, K).
-
-    `np.interp` for all lines at once; places beyond the ends take the values of the ends.
-    """
-    n_known = known.shape[1]
-    # Lines are offset by more than their range, so that one search serves all.
-    line = np.arange(len(known))[:, None]
-    distance = max(known.max(), places.max()) - min(known.min(), places.min()) + 1
-    found = np.searchsorted((known + line * distance).ravel(), (places + line * distance).ravel(), side="right")
-    right = np.clip(found.reshape(places.shape), line * n_known + 1, (line + 1) * n_known - 1)
-    (before, after), *ends = [(flat.take(right - 1), flat.take(right)) for flat in map(np.ravel, (known, *values))]
-    part = np.clip((places - before) / np.maximum(after - before, TINY), 0, 1)
-    return [low + (high - low) * part for low, high in ends]
+def _interpolated(places: FloatArray | IntArray, known: FloatArray, values: FloatArray) -> FloatArray:
+    """(n, K) linear interpolation of `values` (n, P) from ascending `known` (n, P) to the `places` (K,)."""
+    return np.stack([np.interp(places, *line) for line in zip(known, values, strict=True)])
 
 
 def rows_elsewhere(rows: FloatArray, here: FloatArray, there: FloatArray) -> Float32Array:
@@ -204,25 +191,19 @@ def rows_elsewhere(rows: FloatArray, here: FloatArray, there: FloatArray) -> Flo
     if here[0, -1] < here[0, 0]:
         here, there = here[:, ::-1], there[:, ::-1]
     knots = np.append(rows[:-1:_KNOT_ROWS], rows[-1])
-    (inner,) = _interpolated(np.broadcast_to(knots, (len(here), knots.size)), here, there)
     start, end = here[:, :1], here[:, -1:]
     slope = (there[:, -1:] - there[:, :1]) / (end - start)
-    found = inner + slope * (np.minimum(knots - start, 0) + np.maximum(knots - end, 0))
+    found = _interpolated(knots, here, there) + slope * (np.minimum(knots - start, 0) + np.maximum(knots - end, 0))
     # Single precision suffices for rows of a picture.
-    return _between_knots(found.astype(np.float32), knots.astype(np.int64), rows.astype(np.int64))
+    return _between_knots(found.astype(np.float32), knots)
 
 
-def _between_knots(values: NDArray[_Real], knots: IntArray, rows: IntArray) -> NDArray[_Real]:
-    """(n, rows) linear interpolation of values (n, knots), in their own precision."""
-    if knots.size == 1:
-        return values
-    slope = np.diff(values) / np.diff(knots).astype(values.dtype)
-    between = values[:, :-1, None] + slope[..., None] * np.arange(_KNOT_ROWS, dtype=values.dtype)
-    # The last two knots may be closer together than the others.
-    between = between.reshape(values.shape[0], -1)[:, : rows.size]
-    if between.shape[1] < rows.size:
-        between = np.concatenate([between, values[:, -1:]], axis=1)
-    return np.asarray(between, values.dtype)
+def _between_knots(values: NDArray[_Real], knots: FloatArray | IntArray) -> NDArray[_Real]:
+    """(n, rows) linear interpolation of values (n, knots) from the first knot to the last, in their own precision."""
+    # Beyond the last knot the line is level; of its interval, and of the shorter one before, only some rows are used.
+    slope = np.diff(values, append=values[:, -1:]) / np.diff(knots, append=knots[-1] + 1).astype(values.dtype)
+    between = values[..., None] + slope[..., None] * np.arange(_KNOT_ROWS, dtype=values.dtype)
+    return np.asarray(between.reshape(len(values), -1)[:, : int(knots[-1] - knots[0]) + 1], values.dtype)
 
 
 def _sensor_rows(edges_x: FloatArray, knots: IntArray, lens: Lens) -> FloatArray:

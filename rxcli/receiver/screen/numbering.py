@@ -140,22 +140,12 @@ def _film(level: Float32Array, u: FloatArray) -> tuple[float, float] | None:
     return origin + ends[0] / _LEVEL_PARTS, origin + (ends[1] + 1) / _LEVEL_PARTS
 
 
-@dataclass(frozen=True, slots=True)
-class FirstColumns:
-    """Log-odds of each column of a grid to be the screen's first."""
-
-    #: (F,) columns of the grid, and their log-odds, comparable between numbers of columns.
-    columns: IntArray
-    log_odds: FloatArray
-    #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
-    fills: bool
-
-
-def first_columns(light: LightProfile, n_columns: int) -> FirstColumns:
-    """Log-odds of each column of a grid to be the first of a screen with `n_columns`.
+def first_columns(light: LightProfile, n_columns: int) -> tuple[IntArray, FloatArray, bool]:
+    """Columns (F,) of a grid, the log-odds of each to be the screen's first, and whether no side of it is in view.
 
     Light outside the screen, columns outside the picture and a bright picture in the middle decide. If columns are dark
-    at both ends and no such evidence exists, several candidates remain equally likely.
+    at both ends and no such evidence exists, several candidates remain equally likely. Log-odds are comparable between
+    numbers of columns.
     """
     shown = light.place[light.in_picture]
     left, right = float(shown.min()), float(shown.max())
@@ -171,7 +161,7 @@ def first_columns(light: LightProfile, n_columns: int) -> FirstColumns:
     for span in light.spans:
         if span[1] - span[0] < _MAX_SPAN * n_columns:
             odds += _CENTRED * (np.abs(sum(span) / 2 - middles) < _IN_MIDDLE)
-    return FirstColumns(starts, odds, bool(reaches.all()))
+    return starts, odds, bool(reaches.all())
 
 
 def _begins(light: LightProfile, borders: IntArray, side: int) -> BoolArray:

@@ -16,11 +16,13 @@ from rxcli.receiver.light import SlotLight
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_slopes
 from rxcli.receiver.screen.rows import Plane
-from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import LONG_ROWS, Strips
 from rxcli.receiver.screen.waveforms import Mixes, offsets
 from rxcli.types import Clock, Float32Array, FloatArray, Lens
 
+#: Gauss-Newton steps, and prior standard deviations of the finder's columns: shift and widths in screen widths, and
+#: perspective.
+_STEPS, _POSE_SD, _TILT_SD = 3, 0.005, 0.02
 #: Changes of light below which waves are set to zero: products of smaller numbers take many times the time.
 _MIN_WAVE = 1e-3
 
@@ -52,11 +54,11 @@ def corners_by_slots(
     start = _start(strips, corners, n_columns, lens)
     column = columns_at(start.numbers, strips.x, strips.y)
     waves = _waves(strips, column, clock, lit, lens, is_reversed)
-    numbers, sd = start.numbers, SETTINGS.pose_sd * n_columns
+    numbers, sd = start.numbers, _POSE_SD * n_columns
     # The lens stays fixed: the strips were read through it.
-    prior = np.array([sd, sd, sd, SETTINGS.pose_tilt_sd, SETTINGS.pose_tilt_sd, 1e-6]) ** -2.0
+    prior = np.array([sd, sd, sd, _TILT_SD, _TILT_SD, 1e-6]) ** -2.0
     slopes = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
-    for _ in range(SETTINGS.pose_steps):
+    for _ in range(_STEPS):
         mixes = Mixes.of(columns_at(numbers, strips.x, strips.y), sigma, n_columns)
         columns = np.clip(mixes.first_column.astype(np.int64) + np.arange(mixes.share.shape[2]), 0, n_columns - 1)
         windows = np.tile(np.arange(strips.n_windows), strips.n_parts)
@@ -65,7 +67,9 @@ def corners_by_slots(
         normal = (slopes * weight.ravel()) @ slopes.T + np.diag(prior)
         gradient = slopes @ (weight * off).ravel() - prior * (numbers - start.numbers)
         numbers = numbers + np.linalg.solve(normal, gradient)
-    return _corners(replace(start, numbers=numbers), corners, n_columns, aspect)
+    # The middle of the screen stays on its row, and the screen as high as it was.
+    plane = Plane.through(replace(start, numbers=numbers), n_columns, aspect, float(corners[:, 1].mean()))
+    return plane.corners(plane.ends_of(corners))
 
 
 def _start(strips: Strips, corners: FloatArray, n_columns: int, lens: Lens | None) -> Grid:
@@ -105,9 +109,3 @@ def _waves(
     # The row noise is projected off the strips, so it is projected off the waves.
     changes = changes - np.einsum("wcr,wr->wc", changes, noise)[..., None] * noise[:, None]
     return np.asarray(np.where(np.abs(changes) < _MIN_WAVE, 0, changes), np.float32)
-
-
-def _corners(grid: Grid, before: FloatArray, n_columns: int, aspect: float) -> FloatArray:
-    """Corners on the outer borders of a grid; top and bottom at right angles to its columns, as high as they were."""
-    plane = Plane.through(grid, n_columns, aspect, float(before[:, 1].mean()))
-    return plane.corners(plane.ends_of(before))

@@ -3,9 +3,7 @@
 Texture is the light of a cell of pixels over the mean of its neighbours along the row, which hardly shows stripes; the
 mean texture of the frames so far is known in the screen's coordinates (u, v). In a frame the four corners are moved by
 Gauss-Newton steps, on coarse cells and then on the fine ones of steepest texture, until the frame's texture agrees with
-the known one. What
-remains of the stripes differs from column to column, so the scatter of the screen's parts gives the covariance of the
-corners (a sandwich estimate).
+the known one. What remains of the stripes differs from column to column: errors of neighbouring cells are correlated.
 
 The outline of a dark picture is found to several pixels, whereas a picture learned over frames must be aligned to a
 fraction of a pixel, which texture gives. Four free corners follow more than a flat screen before a lens: rows are read
@@ -155,7 +153,7 @@ class ScreenTexture:
             return
         self._known = None
         texture = self._texture_of(frame)
-        value, weight = _read(texture, *self._places(texture, self._plane, _points(*_CELLS)))
+        value, weight = self._read(texture, self._plane, _points(*_CELLS))
         mean, before = np.moveaxis(self._mean, 2, 0)
         total = before + weight
         mean += (value - mean) * (weight / np.maximum(total, np.float32(TINY)))
@@ -186,7 +184,7 @@ class ScreenTexture:
         inverse = np.linalg.inv(np.stack([side_u, side_v], axis=1) / 2)
         to_pixels = (np.eye(4)[:, :, None] * inverse[:, None, None]).reshape(8, 8)
         for _ in range(_ITERATIONS):
-            value, weight = _read(texture, *self._places(texture, plane, known.points))
+            value, weight = self._read(texture, plane, known.points)
             error, weight = known.value - value, weight * known.trust
             squared = error * error
             variance = max(float(np.vdot(weight, squared)) / max(float(weight.sum()), TINY), TINY)
@@ -206,20 +204,15 @@ class ScreenTexture:
         sd_px = float(np.sqrt(np.trace(np.linalg.inv(normal / noise + prior)) / 8))
         return plane, sd_px, correlation
 
-    def _places(self, texture: _Texture, plane: FloatArray, points: FloatArray) -> tuple[Float32Array, Float32Array]:
-        """x and y of `points` (3, n, m) of the screen, in cells of a frame's texture, with the screen at `plane`."""
+    def _read(self, texture: _Texture, plane: FloatArray, points: FloatArray) -> tuple[Float32Array, Float32Array]:
+        """Texture (n, m) at `points` (3, n, m) of the screen, with the screen at `plane`; and its weight, 0 outside."""
+        import cv2
+
         x, y, scale = np.tensordot(geometry.homography(plane), points, 1)
         pixels = geometry.distort(np.stack([x / scale, y / scale], axis=-1), self._lens)
-        x, y = ((pixels[..., axis] + (0.5 - texture.origin[axis])) / texture.cell[axis] - 0.5 for axis in (0, 1))
-        return x.astype(np.float32), y.astype(np.float32)
-
-
-def _read(texture: _Texture, x: Float32Array, y: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """Texture at places of any shape (n, m), and its weight; 0 outside."""
-    import cv2
-
-    read = np.asarray(cv2.remap(texture.values, x, y, cv2.INTER_LINEAR))
-    return read[..., 0], read[..., 1]
+        cells = ((pixels + (0.5 - texture.origin)) / texture.cell - 0.5).astype(np.float32)
+        read = np.asarray(cv2.remap(texture.values, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR))
+        return read[..., 0], read[..., 1]
 
 
 def _texture_of(frame: Frame, start: IntArray, end: IntArray, cell_x: int, cell_y: int) -> _Texture:

@@ -12,7 +12,6 @@ import numpy as np
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen.grid import Grid, columns_at, straightened
-from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import Float32Array, FloatArray
 
@@ -20,8 +19,10 @@ from rxcli.types import Float32Array, FloatArray
 _BINS, _BEYOND = 640, 0.6
 #: Share of the light of lit rows from which a row counts as lit.
 _LIT_SHARE = 0.18
-#: Share of missing height below which the light is taken for the whole screen.
-_WHOLE = 0.07
+#: Share of missing height below which the light is taken for the whole screen; share of the light that is nearly all.
+_WHOLE, _NEARLY_ALL = 0.07, 0.98
+#: Focal length of a camera that no profile describes, picture widths.
+_FOCAL_WIDTHS = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ class Plane:
         the columns is at right angles to both.
         """
         u0, a, b, g, h, _ = grid.numbers
-        focal = SETTINGS.focal_widths if grid.lens is None else grid.lens.camera_matrix[0, 0] / grid.width
+        focal = _FOCAL_WIDTHS if grid.lens is None else grid.lens.camera_matrix[0, 0] / grid.width
         depth = np.array([g * focal, h * focal, 1.0])
         normal = depth / np.linalg.norm(depth)
         across = np.array([(u0 * g + a) * focal, (u0 * h + b) * focal, u0])
@@ -63,12 +64,9 @@ class Plane:
     def pixels(self, points: FloatArray) -> FloatArray:
         """(n, 2) pixels of (n, 2) columns and v."""
         u0, a, b, g, h, _ = self.grid.numbers
-        u, v = points[:, 0] - u0, points[:, 1]
-        matrix = np.empty((len(points), 2, 2))
-        matrix[:, 0, 0], matrix[:, 0, 1] = a - u * g, b - u * h
-        matrix[:, 1, 0], matrix[:, 1, 1] = self.c - v * g, self.d - v * h
-        right = np.stack([u, v - self.v0], axis=-1)
-        return self.grid.pixels_of(np.linalg.solve(matrix, right[..., None])[..., 0])
+        to_plane = np.linalg.inv([[a, b, 0], [self.c, self.d, self.v0], [g, h, 1]])
+        x, y, scale = to_plane @ np.stack([points[:, 0] - u0, points[:, 1], np.ones(len(points))])
+        return self.grid.pixels_of(np.stack([x / scale, y / scale], axis=-1))
 
     def corners(self, ends: tuple[float, float], first_column: int = 0) -> FloatArray:
         """(4, 2) corners, pixels, clockwise from the top left, of the screen between two v from `first_column` on."""
@@ -105,18 +103,18 @@ def find_rows(
     return plane, (bottom - 1, top + 1), False
 
 
-def lit_range(v: FloatArray, light: FloatArray, longest: float = 1.0) -> tuple[float, float]:
-    """Beginning and end of the light, at most `longest` apart."""
+def lit_range(v: FloatArray, light: FloatArray) -> tuple[float, float]:
+    """Beginning and end of the light, at most one screen apart."""
     step = float(v[1] - v[0])
     full = max(float(np.percentile(light[light != 0], 75)), TINY) if light.any() else TINY
     gain = np.concatenate([[0.0], np.cumsum(np.minimum(light, full) - _LIT_SHARE * full)])
-    n = min(round(longest / step), light.size)
+    n = min(round(1 / step), light.size)
     end = int((gain - np.minimum.accumulate(gain)).argmax())
     start = int(gain[: end + 1].argmin())
     if end - start > n:
         # The band pass smears light beyond both ends: use the middle of the positions that hold nearly all of it.
         held = gain[n:] - gain[:-n]
-        start = round(float(np.flatnonzero(held > SETTINGS.nearly_all * held.max()).mean()))
+        start = round(float(np.flatnonzero(held > _NEARLY_ALL * held.max()).mean()))
         end = start + n
     return float(v[0] + (start - 0.5) * step), float(v[0] + (end - 0.5) * step)
 

@@ -9,17 +9,27 @@ fifth of the picture's width has finer strips and its own blocks; everything aft
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
-_Real = TypeVar("_Real", np.float32, np.float64)
+#: Strips across the picture, and across each part of a picture with narrow columns; windows of rows.
+_N_STRIPS, _N_PART_STRIPS, _N_WINDOWS = 200, 150, 16
+#: Rows that are averaged, as a share of the lag at which the correlation of neighbouring strips falls to half its value
+#: at lag one; their minimum and maximum; number of pairs of strips used.
+_SHORT_SHARE, _MIN_SHORT_ROWS, _MAX_SHORT_ROWS, _SAMPLED_STRIPS = 0.8, 2, 6, 25
+#: Share of the strips, the least coherent, that row noise is estimated from; share with the clearest stripes.
+_DARK_SHARE, _BRIGHT_SHARE = 0.3, 0.2
+#: Columns are narrow if the coherence at the far distance, picture widths, is below this share of that at the near.
+_NEAR_WIDTHS, _FAR_WIDTHS, _NARROW_RATIO = 0.004, 0.01, 0.72
+#: Two screens lie apart if strips between them have less than this share of the light, over this many picture widths;
+#: share of the light that each has, and mean coherence of all strips, at least.
+_GAP_LIGHT, _MIN_GAP_WIDTHS, _MIN_APART, _MIN_APART_LIGHT = 0.25, 0.015, 0.2, 0.1
 #: Averaged rows whose mean the band pass takes off.
 LONG_ROWS = 8
 #: Share of a strip's power that may be due to rounding.
@@ -101,11 +111,11 @@ class Strips:
         """The strips on either side of the widest gap without coherent light, the gap in both; none without a gap."""
         lit = self.lit.mean(axis=0)
         share = np.cumsum(lit) / (lit.sum() + np.float32(TINY))
-        is_dark = lit < SETTINGS.gap_light * np.quantile(lit, 0.9)
-        is_dark[(share < SETTINGS.min_apart) | (share > 1 - SETTINGS.min_apart)] = False
+        is_dark = lit < _GAP_LIGHT * np.quantile(lit, 0.9)
+        is_dark[(share < _MIN_APART) | (share > 1 - _MIN_APART)] = False
         edges = np.flatnonzero(np.diff(np.concatenate([[False], is_dark, [False]]).astype(np.int8))).reshape(-1, 2)
         start, end = max(edges.tolist(), key=lambda gap: gap[1] - gap[0], default=(0, 0))
-        if (end - start) * self.step < SETTINGS.min_gap_widths or lit.mean() < SETTINGS.min_apart_light:
+        if (end - start) * self.step < _MIN_GAP_WIDTHS or lit.mean() < _MIN_APART_LIGHT:
             return []
         return [self.blocks(np.s_[:, :end]), self.blocks(np.s_[:, start:])]
 
@@ -120,29 +130,24 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
     """
     light, x = _light_of_strips(plane, n_parts)
     # Windows show no difference between columns and those turned by one column a window, so narrow ones need more.
-    short, n_windows = _short_rows(light), SETTINGS.n_windows if n_parts == 1 else 2 * SETTINGS.n_windows
+    short, n_windows = _short_rows(light), _N_WINDOWS if n_parts == 1 else 2 * _N_WINDOWS
     means = _means_of_rows(light, short, n_windows)
     rows = means.shape[1] // n_windows
     middles = (np.arange(n_windows) + 0.5) * rows * short - 0.5
     points = np.stack(np.meshgrid(x, middles), axis=-1)
     changes, lit, noise = _without_row_noise(_windows(_band_passed(light, means, short), n_windows))
 
-    def parted(values: NDArray[_Real]) -> NDArray[_Real]:
+    def parted(values: NDArray[Any]) -> NDArray[Any]:
         """(W, S, ...) as (parts x W, S / parts, ...)."""
         split = values.reshape(n_windows, n_parts, -1, *values.shape[2:])
         return np.ascontiguousarray(np.moveaxis(split, 1, 0)).reshape(n_parts * n_windows, -1, *values.shape[2:])
 
     stored, flat = (flat_places(points, plane.width, plane.height, model) for model in (None, lens))
-    raw_x, raw_y, x_flat, y_flat = (parted(values) for values in (*stored, *flat))
+    by_window = means.reshape(x.size, n_windows, rows)
+    level, darkest = by_window.mean(axis=2).T, _roughly_linear(plane, by_window.min(axis=2).T)
+    of_strips = zip(_OF_STRIPS, (changes, lit, level, darkest, *stored, *flat), strict=True)
     return Strips(
-        parted(changes),
-        parted(lit),
-        parted(means.reshape(x.size, n_windows, rows).mean(axis=2).T),
-        parted(_roughly_linear(plane, means.reshape(x.size, n_windows, rows).min(axis=2).T)),
-        raw_x,
-        raw_y,
-        x_flat,
-        y_flat,
+        **{name: parted(values) for name, values in of_strips},
         half_height=rows * short / 2 / plane.width,
         row_noise=noise,
         short_rows=short,
@@ -156,7 +161,7 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
 
 def _light_of_strips(plane: LightPlane, n_parts: int) -> tuple[Float32Array, FloatArray]:
     """(S, R) mean values of strips of equal width, equally many per part, and (S,) the middles of the strips."""
-    wanted = SETTINGS.n_strips if n_parts == 1 else n_parts * SETTINGS.n_fifth_strips
+    wanted = _N_STRIPS if n_parts == 1 else n_parts * _N_PART_STRIPS
     n_cells = len(plane.sums) - 1
     cells = max(1, round(n_cells / wanted))
     n = n_cells // cells // n_parts * n_parts
@@ -180,8 +185,8 @@ def flat_places(points: FloatArray, width: int, height: int, lens: Lens | None) 
 
 def shows_narrow_columns(strips: Strips) -> bool:
     """Whether strips are coherent at a short distance only; with wide columns they stay coherent further on."""
-    near, far = (_lit_coherence(strips, widths) for widths in (SETTINGS.near_widths, SETTINGS.far_widths))
-    return far < SETTINGS.narrow_ratio * near
+    near, far = (_lit_coherence(strips, widths) for widths in (_NEAR_WIDTHS, _FAR_WIDTHS))
+    return far < _NARROW_RATIO * near
 
 
 def _lit_coherence(strips: Strips, widths: float) -> float:
@@ -211,7 +216,7 @@ def _short_rows(light: Float32Array) -> int:
     """Rows that may be averaged without losing the slots, from the correlation of neighbouring strips over lags."""
     import cv2
 
-    max_rows, every = SETTINGS.max_short_rows, max(len(light) // SETTINGS.sampled_strips, 2)
+    max_rows, every = _MAX_SHORT_ROWS, max(len(light) // _SAMPLED_STRIPS, 2)
     n = len(light) // every
     left, right = (light[start::every][:n] for start in (0, 1))
     left, right = (part - cv2.blur(part, (8 * max_rows + 1, 1)) for part in (left, right))
@@ -220,7 +225,7 @@ def _short_rows(light: Float32Array) -> int:
     # White row noise does not contribute at lags from 1 on.
     below = [lag for lag, value in enumerate(correlation, 1) if value < correlation[0] / 2]
     half_lag = below[0] if below else n_lags
-    return int(np.clip(round(SETTINGS.short_share * half_lag), SETTINGS.min_short_rows, max_rows))
+    return int(np.clip(round(_SHORT_SHARE * half_lag), _MIN_SHORT_ROWS, max_rows))
 
 
 def _windows(band: Float32Array, n_windows: int) -> Float32Array:
@@ -232,7 +237,7 @@ def _windows(band: Float32Array, n_windows: int) -> Float32Array:
 
 def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Remove the common part of the least coherent strips: changes, (W, S) coherence of neighbours, (W, R) noise."""
-    n_dark = max(int(SETTINGS.dark_share * changes.shape[1]), 1)
+    n_dark = max(int(_DARK_SHARE * changes.shape[1]), 1)
     dark = np.argsort(_smooth(_neighbours(changes), 5, 1), axis=1)[:, :n_dark]
     noise = np.take_along_axis(changes, dark[..., None], axis=1).mean(axis=1)
     quiet = _without(changes, noise)
@@ -270,7 +275,7 @@ def _smooth(values: Float32Array, strips: int, windows: int) -> Float32Array:
 
 def _independent_rows(quiet: Float32Array, lit: Float32Array) -> float:
     """Effective number of independent rows of a window, from the autocorrelation of the most coherent strips."""
-    bright = np.argsort(-lit.mean(axis=0))[: max(int(SETTINGS.bright_share * lit.shape[1]), 1)]
+    bright = np.argsort(-lit.mean(axis=0))[: max(int(_BRIGHT_SHARE * lit.shape[1]), 1)]
     some = quiet[::4, bright]
     rows = some.shape[2]
     lags = range((rows + 1) // 2)

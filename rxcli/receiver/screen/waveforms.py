@@ -13,10 +13,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_slopes, grid_step
-from rxcli.receiver.screen.settings import SETTINGS
 from rxcli.receiver.screen.strips import Strips
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
+#: Ridge regularisation of the waveforms of faint columns, in strips.
+_RIDGE = 0.5
+#: Gain of a fit's steps: they are too short because the waveforms were estimated with the same grid.
+_STEP_GAIN = 2.5
 #: Maximum number of columns of a block: on a plane viewed nearly edge-on the grid counts any number.
 _MAX_COLUMNS = 64
 _TINY = np.float32(1e-6)
@@ -70,7 +73,7 @@ def _halves(strips: Strips, mixes: Mixes) -> Iterator[tuple[slice, Float32Array]
     weighted = mixes.share * np.sqrt(strips.lit)[..., None]
     turned = weighted.transpose(0, 2, 1)
     # Neighbouring strips have nearly the same mix, so half the normal matrix serves either half of them.
-    normal = np.matmul(turned, weighted) / 2 + np.float32(SETTINGS.ridge) * np.eye(len(turned[0]), dtype=np.float32)
+    normal = np.matmul(turned, weighted) / 2 + np.float32(_RIDGE) * np.eye(len(turned[0]), dtype=np.float32)
     inverse = np.linalg.inv(normal)
     for known, predicted in ((slice(0, None, 2), slice(1, None, 2)), (slice(1, None, 2), slice(0, None, 2))):
         yield predicted, np.matmul(inverse, np.matmul(turned[..., known], strips.changes[:, known]))
@@ -147,7 +150,7 @@ def moved_by_waveforms(
         if not weight.any():
             break  # A black picture has no borders.
         slopes = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
-        numbers = numbers + grid_step(numbers, SETTINGS.step_gain * off.ravel(), weight.ravel(), slopes)
+        numbers = numbers + grid_step(numbers, _STEP_GAIN * off.ravel(), weight.ravel(), slopes)
     return replace(grid, numbers=numbers)
 
 

@@ -37,7 +37,7 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
     shifts = [_columns_between(own, rival, n_columns) if rival.family == own.family else 0 for rival in outlines]
     for side in (-1, 1):
         rivals = [index for index, shift in enumerate(shifts) if shift * side > 0]
-        if all(outlines[index].log_odds < own.log_odds - SETTINGS.rival_log_odds for index in rivals):
+        if not rivals:
             continue
         nearest = min(rivals, key=lambda index: abs(shifts[index]))
         moved = replace(best.hypothesis, outline=outlines[nearest], camera=best.context.camera)

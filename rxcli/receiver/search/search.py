@@ -134,11 +134,7 @@ class _Walk:
             hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
             if hypothesis is None:
                 break
-            candidate = replace(self._measured(hypothesis, _acquired(hypothesis)), hypothesis=best.hypothesis)
-            # If the evidence drops, the fit used wrong slots.
-            if candidate.evidence < camera_settings.kept_evidence * best.evidence:
-                break
-            best = candidate
+            best = replace(self._measured(hypothesis, _acquired(hypothesis)), hypothesis=best.hypothesis)
         return best
 
     def best_without_packets(self) -> Scored | None:

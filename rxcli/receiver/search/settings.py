@@ -40,9 +40,7 @@ class SearchSettings:
     likely_certainty: float = 0.5
     sure_certainty: float = 0.9
     may_be_log_odds: float = 3.0
-    #: Outlines of other first columns whose outermost columns are compared: log-odds below the chosen one's, at most.
-    #: Weight of the log-likelihood of packets there, as samples err together.
-    rival_log_odds: float = 5.0
+    #: Weight of the log-likelihood of packets in outermost columns, as samples err together.
     outer_weight: float = 0.2
 
 

@@ -19,7 +19,6 @@ from rxcli.receiver.screen.find import (
     OutlineCandidate,
     find_screens,
     follow_outline,
-    shows_columns,
     why_useless,
     wide_grid,
 )
@@ -287,17 +286,17 @@ def test_a_film_has_sharp_ends_and_fading_light_has_none() -> None:
     (film,) = profile_of("film").spans
     np.testing.assert_allclose(film, (2.6, 17.4), atol=0.3)
     assert not profile_of("fading").spans
-    start = first_columns(profile_of("film"), 20)
-    assert start.columns[start.log_odds.argmax()] == 0
+    columns, log_odds, _ = first_columns(profile_of("film"), 20)
+    assert columns[log_odds.argmax()] == 0
 
 
 @pytest.mark.parametrize("film", [(0.8, 19.2), (0.6, 18.4)])
 def test_narrow_bars_on_both_sides_show_the_first_column(film: tuple[float, float]) -> None:
     place = (np.arange(-16, 22 * 8) + 0.5) / 8
     light = np.where((place > 1.5) & (place < 18.5), 2.0, 0.0)
-    start = first_columns(LightProfile(place, np.ones(place.size, bool), light, (film,)), 20)
-    in_doubt = (start.log_odds > start.log_odds.max() - 2).sum() > 1
-    assert start.columns[start.log_odds.argmax()] == 0 or in_doubt
+    columns, log_odds, _ = first_columns(LightProfile(place, np.ones(place.size, bool), light, (film,)), 20)
+    in_doubt = (log_odds > log_odds.max() - 2).sum() > 1
+    assert columns[log_odds.argmax()] == 0 or in_doubt
     assert in_doubt == (sum(film) != 20)
 
 
@@ -314,9 +313,9 @@ def test_steady_light_around_the_screen_shows_the_first_column() -> None:
 def test_light_that_ends_just_before_the_edge_of_the_picture_ends_on_the_screen() -> None:
     place = (np.arange(-8, 20 * 8 + 3) + 0.5) / 8
     light = np.where((place > 7) & (place < 20), 1.3, -0.1)
-    start = first_columns(LightProfile(place, np.ones(place.size, bool), light, ()), 20)
-    assert start.columns[start.log_odds.argmax()] == 0
-    assert not start.fills
+    columns, log_odds, fills = first_columns(LightProfile(place, np.ones(place.size, bool), light, ()), 20)
+    assert columns[log_odds.argmax()] == 0
+    assert not fills
 
 
 def test_light_ends_where_bars_begin_and_takes_no_more_than_a_screen() -> None:
@@ -376,10 +375,10 @@ def test_wide_columns_are_not_taken_for_narrow_ones() -> None:
 
 
 def test_plain_columns_are_told_from_none() -> None:
-    assert shows_columns(drawn("film"), WIDE.sigma)
+    assert find_screens(drawn("film"), [WIDE])
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
-    assert not shows_columns(plane_of(noise), WIDE.sigma)
-    assert not shows_columns(plane_of(noise[:16, :16]), WIDE.sigma)
+    assert not find_screens(plane_of(noise), [WIDE])
+    assert not find_screens(plane_of(noise[:16, :16]), [WIDE])
 
 
 def test_a_screen_that_moved_a_little_is_followed_and_a_lost_one_is_noticed() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli.receiver.screen import geometry, registration
+from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import ScreenTexture
 from rxcli.types import FloatArray, Frame
 
@@ -59,8 +59,8 @@ def test_a_fit_ends_when_the_corners_rest(monkeypatch: pytest.MonkeyPatch) -> No
     """Coarse and fine cells together take a few steps, though the stripes are others."""
     panel, steps = texture(), []
     known = known_of(panel)
-    read = registration._read
-    monkeypatch.setattr(registration, "_read", lambda *at: (steps.append(1), read(*at))[1])
+    read = ScreenTexture._read
+    monkeypatch.setattr(ScreenTexture, "_read", lambda *at: (steps.append(1), read(*at))[1])
     found = known.find(picture_of(panel, CORNERS + np.array([3.0, -2.0]), 9))
     assert found.is_precise
     assert len(steps) <= 7
