@@ -325,7 +325,7 @@ def slot_margin(metrics: FloatArray, decided: NDArray[np.bool_]) -> Float32Array
     return margin.astype(np.float32)
 
 
-def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
+def plausible_weights(metrics: FloatArray, margin: float, llr: Float32Array | None = None) -> NDArray[np.bool_]:
     """Candidate weights, (C, 9): the likeliest one and all within a log-likelihood of `margin`.
 
     Slots count as independent and a symbol of weight w as any of the C(10, w) words. The likelihoods of all weights are
@@ -334,8 +334,9 @@ def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
     Args:
         metrics: (B, C, packet + memory, patterns) log-likelihoods of B bursts.
         margin: log-likelihood below the likeliest weight.
+        llr: `slot_llr` of the metrics, where it is known.
     """
-    llr = np.clip(slot_llr(metrics), -SETTINGS.max_llr, SETTINGS.max_llr)
+    llr = np.clip(slot_llr(metrics) if llr is None else llr, -SETTINGS.max_llr, SETTINGS.max_llr)
     symbols = llr.reshape(*llr.shape[:2], -1, SLOTS_PER_SYMBOL)
     payload = symbols[:, :, 2:]
     coefficients = np.zeros((*payload.shape[:-1], SLOTS_PER_SYMBOL + 1))
