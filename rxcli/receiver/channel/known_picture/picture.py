@@ -46,15 +46,13 @@ class KnownPicture:
     Args:
         shape: columns, strips of a column, and rows.
         crosstalk: crosstalk of the strips.
-        black_level: light of a dark slot, common or (C, S).
+        black_level: light of a dark slot.
         noise: noise of a strip's light.
     """
 
-    def __init__(
-        self, shape: tuple[int, ...], crosstalk: Crosstalk, black_level: float | Float32Array, noise: NoiseModel
-    ) -> None:
+    def __init__(self, shape: tuple[int, ...], crosstalk: Crosstalk, black_level: float, noise: NoiseModel) -> None:
         self._crosstalk = crosstalk.shares.astype(np.float32)
-        self._black_level = np.asarray(black_level, np.float32)[..., None]
+        self._black_level = np.float32(black_level)
         self._noise = noise
         #: (4, C, S, R) sums over the frames, see `_update_of`.
         self._sums: Float32Array = np.zeros((4, *shape), np.float32)
@@ -150,9 +148,9 @@ class PlacedPicture:
     variance: Float32Array
     #: (C, S, R) the strip is on the screen.
     inside: BoolArray
-    #: (S, 3) see `Crosstalk`; and light of a dark slot, common or (C, S, 1).
+    #: (S, 3) see `Crosstalk`; and light of a dark slot.
     crosstalk: Float32Array
-    black_level: Float32Array
+    black_level: np.float32
     #: (C,) variance of the columns' light over what is predicted; `judge` updates it in place.
     excess: Float32Array
 

@@ -45,8 +45,6 @@ class KnownPictureSettings:
 
     #: Distance from the middle of a slot within which rows count for its first decision, slots.
     decision_reach: float = 0.35
-    #: Minimum number of dark rows of a strip, over all frames, for its dark light.
-    min_dark_rows: int = 12
     #: Minimum number of header rows, times the precision of the prior, for a header contrast.
     min_header_rows: int = 40
 
