@@ -45,26 +45,28 @@ class Burst:
     def posteriors(self) -> BurstPosteriors:
         """Of this burst alone."""
         metrics = self.metrics[None]
-        return detect.detect(metrics, detect.plausible_weights(metrics, receiver_settings.weight_margin))
+        return detect.detect(metrics, detect.plausible_weights(metrics, receiver_settings.weight_margin, self._llr))
+
+    @cached_property
+    def _llr(self) -> Float32Array:
+        return slot_llr(self.metrics[None])
 
     @property
     def certain(self) -> BoolArray:
         """(C,) columns that further frames add nothing to."""
         return np.asarray(self.posteriors.log_prob[0].min(axis=1) >= SETTINGS.certain_log_prob)
 
-    @property
-    def probability(self) -> Float32Array:
-        """(C,) of the packets as detected, by the light model alone."""
-        return np.asarray(np.exp(self.posteriors.log_prob[0].sum(axis=1)), np.float32)
+    def probability(self, column: int) -> float:
+        """Probability of a column's packet as detected, by the light model alone."""
+        return float(np.exp(self.posteriors.log_prob[0, column].sum()))
 
     def ended(self, view: View) -> confidence.BurstInClip:
         """What is reported of it; `view` is of the last frame that shows it."""
         assert view.numbers is not None
         features = against = None
         if self.tracked:
-            llr = slot_llr(self.metrics[None])[0, :, PREAMBLE_SLOTS:]
             decided = np.sign(self.posteriors.lit[0, :, PREAMBLE_SLOTS:] - 0.5)
-            against = np.asarray(np.maximum(-llr * decided, 0).max(axis=1), np.float32)
+            against = np.maximum(-self._llr[0, :, PREAMBLE_SLOTS:] * decided, 0).max(axis=1)
         else:
             margin = detect.slot_margin(self.metrics[None], self.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
             undenoised = np.zeros(margin.shape[1], bool)

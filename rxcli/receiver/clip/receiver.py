@@ -193,9 +193,10 @@ def _is_doubled(frame: Frame, before: Frame, corners: FloatArray | None) -> bool
     """
     if corners is None or before.pixels.shape != frame.pixels.shape:
         return False
-    inside = np.clip(corners, 0, [frame.width - 1, frame.height - 1])
-    columns, rows = np.linspace(inside.min(axis=0), inside.max(axis=0), SETTINGS.same_points).astype(int).T
-    pixels, earlier = (each.pixels[np.ix_(rows, columns)].astype(np.float32) for each in (frame, before))
+    starts, ends = np.maximum(corners.min(axis=0), 0).astype(int), np.ceil(corners.max(axis=0)).astype(int)
+    steps = np.maximum((ends - starts) // SETTINGS.same_points, 1)
+    columns, rows = map(slice, starts.tolist(), ends.tolist(), steps.tolist())
+    pixels, earlier = (each.pixels[rows, columns].astype(np.float32) for each in (frame, before))
     contrast = float(np.abs(np.diff(pixels, axis=0)).mean())
     if contrast < SETTINGS.min_contrast * (frame.white - frame.black):
         return False

@@ -16,7 +16,7 @@ from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.confidence import BurstInClip
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
 from rxcli.results.dump import dump_stages
-from rxcli.types import FrameResult, IntArray
+from rxcli.types import BELIEVABLE, FrameResult, IntArray
 
 
 def completed(
@@ -43,7 +43,7 @@ def completed(
     columns = assemble.clip_results(
         view.bursts.clock,
         ended,
-        np.max([np.zeros(len(view.snr), np.float32), *(burst.probability for burst in going_on)], axis=0),
+        lambda column: any(burst.probability(column) >= BELIEVABLE for burst in going_on),
         view.snr,
         link.headerless(ended, len(view.snr)),
         options.min_confidence,

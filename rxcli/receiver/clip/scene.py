@@ -53,7 +53,7 @@ class TrackedScreen:
         self._n_updates = 0
         #: (C,) mean light of the columns in the last frame, and its exposure relative to that of the picture.
         self._level, self._gain = np.maximum(self.strips(frame).mean(axis=(1, 2)), TINY), 1.0
-        self._picture = self._new_picture(black_level)
+        self._picture = self._new_picture()
 
     @property
     def corners(self) -> FloatArray:
@@ -105,7 +105,7 @@ class TrackedScreen:
             return None
         with timer("detect"):
             lit = known_picture.first_decision(columns, known_picture.row_positions(pose.rows, clock), clock)
-            measured = _measured(picture, pose.rows, light, columns, clock, lit, last.isi_memory, max_misfit)
+            measured = _measured(picture, pose.rows, columns, clock, lit, last.isi_memory, max_misfit)
             if measured is None:
                 return None
             columns, clock, likelihoods = measured
@@ -180,11 +180,13 @@ class TrackedScreen:
 
     # -- the picture ---------------------------------------------------------------------------------------------------
 
-    def _new_picture(self, black_level: float | Float32Array) -> known_picture.KnownPicture:
+    def _new_picture(self) -> known_picture.KnownPicture:
         strips, profiles = self._first_pose.map, self._acquisition.profiles
         noise = NoiseModel(max(profiles.noise_floor, SETTINGS.min_variance * strips.pixels), profiles.noise_slope)
         crosstalk = Crosstalk.of(self._n_strips, self._acquisition.screen.light_spread)
-        return known_picture.KnownPicture(strips.inside.shape, crosstalk, black_level, noise.of_mean(strips.pixels))
+        return known_picture.KnownPicture(
+            strips.inside.shape, crosstalk, self._black_level, noise.of_mean(strips.pixels)
+        )
 
     def _placed(self, pose: Pose) -> PlacedPicture:
         """The picture on the rows of a pose."""
@@ -235,22 +237,11 @@ class TrackedScreen:
             doubtful: of each, whether it is to be measured.
         """
         self._n_updates = 0
-        self._picture = self._new_picture(self._dark_light(views))
+        self._picture = self._new_picture()
         updates = [self.learn(view, lit, forget=False) for view, lit in zip(views, known, strict=True)]
         for view, update, lit, needed in zip(views, updates, known, doubtful, strict=True):
             if needed and update is not None:
                 self._measure_again(view, update, lit)
-
-    def _dark_light(self, views: Sequence[View]) -> Float32Array:
-        """(C, S) light of the strips where nothing is lit."""
-        lights, dark, inside = [], [], []
-        for view in views:
-            if view.light is not None and view.pose is not None:
-                positions = known_picture.row_positions(view.pose.rows, view.bursts.clock)
-                lights.append(view.light)
-                dark.append(known_picture.header_dark(positions, view.bursts.clock))
-                inside.append(view.pose.map.inside)
-        return known_picture.dark_light(lights, dark, inside, self._black_level)
 
     def _measure_again(self, view: View, own: Float32Array, known: Float32Array) -> None:
         """Measure a frame by the picture, less what the frame itself has shown of it."""
@@ -261,7 +252,7 @@ class TrackedScreen:
         columns = picture.solve(view.light)
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:
             return
-        measured = _measured(picture, pose.rows, view.light, columns, clock, known, view.isi_memory, SETTINGS.misfit)
+        measured = _measured(picture, pose.rows, columns, clock, known, view.isi_memory, SETTINGS.misfit)
         if measured is not None:
             view.flat, clock, found = measured
             view.snr = found.snr
@@ -281,7 +272,6 @@ def followed_outline(frame: Frame, corners: FloatArray, screen: ScreenProfile) -
 def _measured(
     picture: PlacedPicture,
     rows: FloatArray,
-    light: Float32Array,
     columns: ColumnLight,
     clock: Clock,
     lit: Float32Array,
@@ -294,10 +284,6 @@ def _measured(
     """
     positions = known_picture.row_positions(rows, clock)
     fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
-    if fit.response.centre < SETTINGS.faded:
-        expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit.response)
-        columns = picture.solve_again(light, expected.light, clock.rows_per_slot)
-        fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
     if abs(fit.late) > SETTINGS.late_slots:
         clock = replace(clock, row0=clock.row0 - fit.late * clock.rows_per_slot)
         positions = known_picture.row_positions(rows, clock)

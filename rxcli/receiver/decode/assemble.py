@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,6 @@ from rxcli.protocol import PREAMBLE_SLOTS, bits_per_symbol, indices_to_bits
 from rxcli.receiver.decode.confidence import BurstInClip, Quality, clip_quality, still_quality
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import (
-    BELIEVABLE,
     BoolArray,
     BurstPosteriors,
     Clock,
@@ -67,14 +66,14 @@ def column_results(
     if not any((burst.possible & ~headerless)[sure[index]].any() for index, burst in enumerate(bursts)):
         # Light without data: an isolated packet is chance.
         bursts = [replace(burst, possible=np.zeros_like(burst.possible)) for burst in bursts]
-    columns = _columns(clock, bursts, snr_db, headerless, np.zeros_like(headerless), min_confidence)
+    columns = _columns(clock, bursts, snr_db, headerless, lambda column: False, min_confidence)
     return tuple(replace(column, denoised=column.column in denoised) for column in columns)
 
 
 def clip_results(
     clock: Clock,
     bursts: Sequence[BurstInClip],
-    going_on: Float32Array,
+    goes_on: Callable[[int], bool],
     snr: Float32Array,
     headerless: BoolArray,
     min_confidence: float,
@@ -85,7 +84,7 @@ def clip_results(
     Args:
         clock: the clock.
         bursts: bursts that end in this frame, in time order.
-        going_on: (C,) confidence of the best packet that the next frame will report.
+        goes_on: whether the next frame will report a packet of a column.
         snr: (C, N) squared contrast over variance of every slot of the grid.
         headerless: (C,) columns without packets, see `find_headerless`.
         min_confidence: packets below it are left out.
@@ -100,7 +99,7 @@ def clip_results(
         )
         for burst in bursts
     ]
-    return _columns(clock, ended, snr_db, headerless, going_on >= BELIEVABLE, min_confidence)
+    return _columns(clock, ended, snr_db, headerless, goes_on, min_confidence)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +181,7 @@ def _columns(
     bursts: Sequence[_Burst],
     snr_db: Sequence[float | None],
     headerless: BoolArray,
-    goes_on: BoolArray,
+    goes_on: Callable[[int], bool],
     min_confidence: float,
 ) -> tuple[ColumnResult, ...]:
     """Results of every column; a column that `goes_on` has packets in the next frame."""
@@ -193,7 +192,7 @@ def _columns(
         packets = tuple(burst.packets[column] for burst in reported)
         confidence = max((burst.packets[column].confidence for burst in possible), default=0.0)
         status = _column_status(packets, db)
-        if not packets and goes_on[column] and not headerless[column]:
+        if not packets and not headerless[column] and goes_on(column):
             status = "ok"
         if packets:
             message = None

@@ -101,8 +101,13 @@ def _header_llr(metrics: FloatArray) -> FloatArray:
     isi_memory = _isi_memory_of(metrics)
     header = metrics[:, :, isi_memory : len(HEADER)]
     likelihood, top = _over_likeliest(header)
-    known = header[:, :, np.arange(len(HEADER) - isi_memory), _pattern_index(np.array(HEADER), isi_memory)]
+    known = header[:, :, np.arange(len(HEADER) - isi_memory), _header_patterns(isi_memory)]
     return np.asarray((known - top[..., 0] - np.log(likelihood.mean(axis=-1))).sum(axis=2))
+
+
+@cache
+def _header_patterns(isi_memory: int) -> NDArray[np.int64]:
+    return _pattern_index(np.array(HEADER), isi_memory)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,6 +159,7 @@ def _pattern_index(slots: NDArray[np.integer], isi_memory: int) -> NDArray[np.in
     return windows @ (1 << np.arange(isi_memory, -1, -1))
 
 
+@cache
 def _states(isi_memory: int) -> NDArray[np.int64]:
     """(states, memory) slots of each state; also the bits of each number, most significant first."""
     states: NDArray[np.int64] = (np.arange(1 << isi_memory)[:, None] >> np.arange(isi_memory - 1, -1, -1)) & 1
@@ -325,7 +331,7 @@ def slot_margin(metrics: FloatArray, decided: NDArray[np.bool_]) -> Float32Array
     return margin.astype(np.float32)
 
 
-def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
+def plausible_weights(metrics: FloatArray, margin: float, llr: Float32Array | None = None) -> NDArray[np.bool_]:
     """Candidate weights, (C, 9): the likeliest one and all within a log-likelihood of `margin`.
 
     Slots count as independent and a symbol of weight w as any of the C(10, w) words. The likelihoods of all weights are
@@ -334,16 +340,17 @@ def plausible_weights(metrics: FloatArray, margin: float) -> NDArray[np.bool_]:
     Args:
         metrics: (B, C, packet + memory, patterns) log-likelihoods of B bursts.
         margin: log-likelihood below the likeliest weight.
+        llr: `slot_llr` of the metrics, where it is known.
     """
-    llr = np.clip(slot_llr(metrics), -SETTINGS.max_llr, SETTINGS.max_llr)
+    llr = np.clip(slot_llr(metrics) if llr is None else llr, -SETTINGS.max_llr, SETTINGS.max_llr)
     symbols = llr.reshape(*llr.shape[:2], -1, SLOTS_PER_SYMBOL)
-    payload = symbols[:, :, 2:]
-    coefficients = np.zeros((*payload.shape[:-1], SLOTS_PER_SYMBOL + 1))
-    coefficients[..., 0] = 1.0
-    for slot in np.moveaxis(np.exp(payload), -1, 0):
-        coefficients[..., 1:] += coefficients[..., :-1] * slot[..., None]
+    payload = np.ascontiguousarray(np.moveaxis(symbols[:, :, 2:], -1, 0))
+    coefficients = np.zeros((SLOTS_PER_SYMBOL + 1, *payload.shape[1:]))
+    coefficients[0] = 1.0
+    for slot in np.exp(payload):
+        coefficients[1:] += coefficients[:-1] * slot
     words = np.array([comb(SLOTS_PER_SYMBOL, w) for w in WEIGHTS])
-    score = np.log(coefficients[..., 1:SLOTS_PER_SYMBOL] / words).sum(axis=(0, 2))
+    score = np.log(coefficients[1:SLOTS_PER_SYMBOL]).sum(axis=(1, 3)).T - np.log(words) * payload[0, :, 0].size
     score += np.cumsum(symbols[:, :, 1], axis=2)[..., : len(WEIGHTS)].sum(axis=0)
     # Each metric was counted once for every slot that it covers.
     lead = margin * (_isi_memory_of(metrics) + 1) / 2

@@ -77,7 +77,8 @@ def cells_of(band: NDArray[Any], cell_px: int) -> NDArray[Any]:
     while cell_px > 1:
         half = 8 * band.dtype.itemsize
         pairs = band.view(f"u{2 * band.dtype.itemsize}")
-        band = (pairs & pairs.dtype.type((1 << half) - 1)) + (pairs >> pairs.dtype.type(half))
+        band = pairs >> pairs.dtype.type(half)
+        band += pairs & pairs.dtype.type((1 << half) - 1)
         cell_px //= 2
     return band
 

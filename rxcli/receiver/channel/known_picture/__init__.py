@@ -10,7 +10,7 @@ compression, `header` measures the contrast of headers, and `metrics` computes s
 """
 
 from rxcli.receiver.channel.known_picture.exposure import expected_light, row_positions
-from rxcli.receiver.channel.known_picture.header import dark_light, first_decision, header_contrast, header_dark
+from rxcli.receiver.channel.known_picture.header import first_decision, header_contrast
 from rxcli.receiver.channel.known_picture.metrics import slot_likelihoods
 from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Observation, PlacedPicture
 from rxcli.receiver.channel.known_picture.response import fit_response
@@ -20,12 +20,10 @@ __all__ = [
     "KnownPicture",
     "Observation",
     "PlacedPicture",
-    "dark_light",
     "expected_light",
     "first_decision",
     "fit_response",
     "header_contrast",
-    "header_dark",
     "row_positions",
     "slot_likelihoods",
 ]

@@ -7,8 +7,8 @@ import numpy as np
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.known_picture.picture import ColumnLight
 from rxcli.receiver.channel.known_picture.settings import SETTINGS
-from rxcli.receiver.light import sees_dark_header, take_places
-from rxcli.types import BoolArray, Clock, Float32Array, FloatArray
+from rxcli.receiver.light import take_places
+from rxcli.types import Clock, Float32Array, FloatArray
 
 
 def first_decision(observed: ColumnLight, positions: FloatArray, clock: Clock) -> Float32Array:
@@ -50,33 +50,3 @@ def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) 
     if weight.sum() < SETTINGS.prior_precision * SETTINGS.min_header_rows:
         return 1.0
     return float((weight * sign * np.clip(2 * value - 1, -1.5, 1.5)).sum() / weight.sum())
-
-
-def header_dark(positions: FloatArray, clock: Clock) -> BoolArray:
-    """(C, R) or (1, R) rows whose exposure lies in the three dark slots in the middle of a header."""
-    return sees_dark_header((positions + clock.first_slot) % clock.packet_slots, clock.exposure_slots)
-
-
-def dark_light(
-    lights: list[Float32Array], dark: list[BoolArray], inside: list[BoolArray], usual: float
-) -> Float32Array:
-    """(C, S) light of the strips in dark slots.
-
-    It includes the offset left by a black picture or a low-bitrate encoder, which does not depend on the slots.
-
-    Args:
-        lights: (C, S, R) each.
-        dark: (C, R) or (1, R) each, from `header_dark`.
-        inside: (C, S, R) each, as for `KnownPicture`.
-        usual: value for strips with too few dark rows.
-    """
-    observed = [
-        np.where(np.broadcast_to(rows[:, None], light.shape) & on, light, np.float32(np.nan))[..., rows.any(axis=0)]
-        for light, rows, on in zip(lights, dark, inside, strict=True)
-    ]
-    together = np.concatenate(observed, axis=2)
-    few = (~np.isnan(together)).sum(axis=2) < SETTINGS.min_dark_rows
-    if together.shape[2] == 0:
-        return np.full(together.shape[:2], usual, np.float32)
-    together[few] = np.float32(usual)
-    return np.asarray(np.nanmedian(together, axis=2), np.float32)
