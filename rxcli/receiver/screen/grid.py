@@ -15,8 +15,8 @@ from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.strips import flat_places
 from rxcli.types import FloatArray, Lens
 
-#: Prior standard deviation of radial distortion.
-_RADIAL_SD = 0.004
+#: Prior standard deviations of perspective and of radial distortion.
+_PERSPECTIVE_SD, _RADIAL_SD = 0.15, 0.004
 _INVERSE_STEPS = 12
 #: Gauss-Newton steps to a grid through given columns; their spacing, as they lie on a smooth surface; their precision,
 #: columns to the power of minus two.
@@ -126,7 +126,7 @@ def grid_slopes(numbers: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray
 
 
 def grid_step(numbers: FloatArray, off: FloatArray, weight: FloatArray, slopes: FloatArray) -> FloatArray:
-    """(6,) Gauss-Newton step of a grid's parameters that moves its columns by `off`, with the prior.
+    """(6,) Gauss-Newton step of a grid's parameters that moves its columns by `off`, with the priors.
 
     Args:
         numbers: (6,) of the grid.
@@ -134,7 +134,8 @@ def grid_step(numbers: FloatArray, off: FloatArray, weight: FloatArray, slopes: 
         weight: (n,) their precision.
         slopes: (6, n), see `grid_slopes`.
     """
-    prior = np.array([0, 0, 0, 0, 0, _RADIAL_SD**-2])
+    tilt, radial = _PERSPECTIVE_SD**-2, _RADIAL_SD**-2
+    prior = np.array([0, 0, 0, tilt, tilt, radial])
     normal = (slopes * weight) @ slopes.T
     gradient = slopes @ (weight * off) - prior * numbers
     return np.asarray(np.linalg.solve(normal + np.diag(prior + 1e-3 * np.diag(normal)), gradient))
