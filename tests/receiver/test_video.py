@@ -405,6 +405,28 @@ def known_picture(rng: np.random.Generator, columns: int = 6, strips: int = 4, r
     return known, frame
 
 
+def test_strips_that_show_something_else_are_trusted_less() -> None:
+    rng = np.random.default_rng(8)
+    known, frame = known_picture(rng)
+    light, slots = frame()
+    light[:, 0] += rng.normal(0, 0.2, light[:, 0].shape).astype(np.float32)
+    placed = known.placed(np.ones(light.shape, bool))
+    plain = np.abs(placed.solve(light).value - slots).mean()
+    again = np.abs(placed.solve_again(light, slots, 5.0).value - slots).mean()
+    assert again < 0.5 * plain
+
+
+def test_a_decision_does_not_bear_itself_out() -> None:
+    """One slot that shows the opposite of what was decided must still show it."""
+    known, frame = known_picture(np.random.default_rng(9))
+    light, slots = frame()
+    wrong = slots.copy()
+    wrong[2, 200:205] = 1 - wrong[2, 200:205]
+    placed = known.placed(np.ones(light.shape, bool))
+    reception = placed.solve_again(light, wrong, 5.0).value[2, 201:204]
+    assert np.abs(reception - slots[2, 201:204]).max() < 0.1
+
+
 def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
     known, frame = known_picture(np.random.default_rng(10))
     other = copy.deepcopy(known)

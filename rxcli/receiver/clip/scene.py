@@ -105,7 +105,7 @@ class TrackedScreen:
             return None
         with timer("detect"):
             lit = known_picture.first_decision(columns, known_picture.row_positions(pose.rows, clock), clock)
-            measured = _measured(picture, pose.rows, columns, clock, lit, last.isi_memory, max_misfit)
+            measured = _measured(picture, pose.rows, light, columns, clock, lit, last.isi_memory, max_misfit)
             if measured is None:
                 return None
             columns, clock, likelihoods = measured
@@ -252,7 +252,7 @@ class TrackedScreen:
         columns = picture.solve(view.light)
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:
             return
-        measured = _measured(picture, pose.rows, columns, clock, known, view.isi_memory, SETTINGS.misfit)
+        measured = _measured(picture, pose.rows, view.light, columns, clock, known, view.isi_memory, SETTINGS.misfit)
         if measured is not None:
             view.flat, clock, found = measured
             view.snr = found.snr
@@ -272,6 +272,7 @@ def followed_outline(frame: Frame, corners: FloatArray, screen: ScreenProfile) -
 def _measured(
     picture: PlacedPicture,
     rows: FloatArray,
+    light: Float32Array,
     columns: ColumnLight,
     clock: Clock,
     lit: Float32Array,
@@ -284,6 +285,10 @@ def _measured(
     """
     positions = known_picture.row_positions(rows, clock)
     fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
+    if fit.response.centre < SETTINGS.faded:
+        expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit.response)
+        columns = picture.solve_again(light, expected.light, clock.rows_per_slot)
+        fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
     if abs(fit.late) > SETTINGS.late_slots:
         clock = replace(clock, row0=clock.row0 - fit.late * clock.rows_per_slot)
         positions = known_picture.row_positions(rows, clock)

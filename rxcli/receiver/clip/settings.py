@@ -28,8 +28,10 @@ class ClipSettings:
     #: that is taken to rest: while it does 0.8 to 1.3 times, 2 pixels away 2 times and more.
     misfit: float = 40.0
     rest_misfit: float = 1.5
-    #: Contrast of headers, against full, below which nothing is known any more.
+    #: Contrast of headers, against full, below which nothing is known any more, and contrast of a frame below which
+    #: compression has taken much of it.
     min_header: float = 0.3
+    faded: float = 0.85
     #: Minimum lateness of the clock that is corrected, slots.
     late_slots: float = 0.03
     #: Change of the exposure from which light is scaled to that of the picture; weights change it by up to 0.15.

@@ -164,7 +164,27 @@ class PlacedPicture:
         Args:
             light: (C, S, R).
         """
-        shrunk, precision = self._equations.solve(light - self.black_level), self._equations.precision
+        return self._solved(light, self._equations)
+
+    def solve_again(self, light: Float32Array, expected: Float32Array, rows_per_slot: float) -> ColumnLight:
+        """Solve again with strips weighted by their errors in neighbouring slots.
+
+        A slot's own error is left out, because it would confirm the decision of that slot.
+
+        Args:
+            light: (C, S, R).
+            expected: (C, R) light predicted from the decided slots.
+            rows_per_slot: rows per slot.
+        """
+        error = light - self.black_level - self.picture * (self.crosstalk @ _with_neighbours(expected))
+        error *= error
+        error *= self.inside
+        around = _around(error, rows_per_slot) / (_around(self.inside.astype(np.float32), rows_per_slot) + 1e-3)
+        gain = self.picture * self.inside / (self.variance + np.maximum(around, 0))
+        return self._solved(light, RowEquations.of(self.picture, gain, self.crosstalk))
+
+    def _solved(self, light: Float32Array, equations: RowEquations) -> ColumnLight:
+        shrunk, precision = equations.solve(light - self.black_level), equations.precision
         prior = np.float32(SETTINGS.prior_precision)
         value = shrunk + (shrunk - np.float32(0.5)) * (prior / np.maximum(precision, np.float32(1e-3)))
         # Precisions are reduced by the estimated noise of the columns; 0 where almost nothing is visible.
@@ -229,6 +249,12 @@ def _with_neighbours(columns: Float32Array) -> Float32Array:
     out = np.zeros((len(columns), 3, columns.shape[1]), np.float32)
     out[1:, 0], out[:, 1], out[:-1, 2] = columns[:-1], columns, columns[1:]
     return out
+
+
+def _around(values: Float32Array, rows_per_slot: float) -> Float32Array:
+    """Sum over the neighbouring slots without a row's own, along the last axis."""
+    near, far = (int(slots * rows_per_slot) for slots in (SETTINGS.own_slots, SETTINGS.error_slots))
+    return box_sums(values, far) - box_sums(values, near)
 
 
 def _resampled(values: Float32Array, rows: Float32Array, *, beyond: bool) -> Float32Array:

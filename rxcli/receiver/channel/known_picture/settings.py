@@ -32,6 +32,9 @@ class KnownPictureSettings:
     prior_precision: float = 4.0
     #: Error of a column's light, relative to full light, that is common to all strips.
     common_error: float = 0.04
+    #: Slots on each side over which a strip's error is averaged, and the inner ones that are left out.
+    error_slots: float = 20.0
+    own_slots: float = 1.3
     #: Correlation of errors within a slot: minimum precision of a slot's light, weight of the mean over all columns in
     #: slots, and lower limit of the ratio to uncorrelated errors.
     min_slot_precision: float = 0.5
