@@ -25,8 +25,8 @@ from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
 #: The next step where a picture is too dark.
 BRIGHTEN = "expose longer, raise ISO, or show a brighter picture on the screen"
-#: Minimum width and height of a picture, pixels.
-MIN_SIZE_PX = 96
+#: Minimum width and height of a picture, pixels, and minimum number of strips across it.
+MIN_SIZE_PX, _MIN_STRIPS = 96, 120
 #: Number of columns from which a screen's columns count as narrow, and parts of a picture that are searched for them.
 _NARROW_COLUMNS, _PARTS = 50, 5
 #: Factor by which the followed width of a grid of narrow columns grows at a time.
@@ -94,6 +94,8 @@ def find_screens(
     if min(plane.width, plane.height) < MIN_SIZE_PX:
         return []
     strips = read_strips(plane, lens)
+    if strips.lit.shape[1] < _MIN_STRIPS:
+        return []
     narrow, wide = ([layout for layout in layouts if layout.is_narrow is many] for many in (True, False))
     screens = _screens_apart(strips, wide) if wide else []
     if screens:
