@@ -50,7 +50,7 @@ class LightProfile:
     in_picture: BoolArray
     #: (P,) log-odds that a part is on the screen.
     log_odds: FloatArray
-    #: Columns at which begins and ends what probably lies in the screen's middle: a bright picture with dark on both
+    #: First and last column of each thing whose middle is probably the screen's: a bright picture with dark on both
     #: sides, and the screen with its frame in a lighted room.
     spans: tuple[tuple[float, float], ...]
 

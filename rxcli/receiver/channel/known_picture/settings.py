@@ -11,7 +11,7 @@ class KnownPictureSettings:
 
     #: Forgetting factor: share of its weight that a frame keeps with each later frame.
     memory_share: float = 0.95
-    #: Weight of the mean light of neighbouring rows relative to one observation of a row at full light.
+    #: Weight of the picture of the neighbouring rows relative to one observation of a row at full light.
     smooth_weight: float = 0.05
     #: Squared error of the predicted light of a strip, relative to full light.
     prediction_error: float = 0.01
