@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import MIN_FLOAT32, TINY
+from rxcli.numerics import MIN_FLOAT32, NORMAL_MEDIAN, TINY
 from rxcli.protocol import HEADER, slot_patterns
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -30,6 +30,8 @@ _MAX_MEMORY = 5
 #: The dark slots in the middle of a header.
 _DARK_FROM = HEADER.index(0, HEADER.index(1))
 _DARK_TO = HEADER.index(1, _DARK_FROM)
+#: Largest light above black, relative to white, of a sample that counts as dark, and minimum number of those.
+_DARK_LIGHT, _MIN_DARK_SAMPLES = 0.001, 50
 #: Shortest exposure, slots, and narrowest spread of light, column pitches.
 _MIN_WIDTH = 1e-3
 
@@ -61,6 +63,16 @@ class NoiseModel:
         out *= expected
         out += np.float32(self.dark_variance)
         return out
+
+
+def dark_sigma(light: Float32Array, valid: Float32Array, black_level: float, min_sigma: float) -> float:
+    """Standard deviation of dark samples (..., n) in order of time, from second differences; at least `min_sigma`."""
+    mean = (light[..., 2:] + light[..., 1:-1] + light[..., :-2]) / 3
+    dark = (mean < black_level + _DARK_LIGHT) & (valid[..., 2:] * valid[..., :-2] > 0)
+    second_difference = (light[..., 2:] - 2 * light[..., 1:-1] + light[..., :-2])[dark]
+    if second_difference.size < _MIN_DARK_SAMPLES:
+        return min_sigma
+    return max(float(np.median(np.abs(second_difference)) / (NORMAL_MEDIAN * np.sqrt(6.0))), min_sigma)
 
 
 def exposure_shares(

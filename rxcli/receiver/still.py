@@ -16,7 +16,7 @@ from rxcli.receiver import channel
 from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import detect
-from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, slot_llr
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma, slot_llr
 from rxcli.receiver.reception import (
     Reception,
     best_log_prob,
@@ -230,7 +230,8 @@ def _light_model(acquisition: Acquisition, clock: Clock, samples: SlotSamples) -
     profiles = acquisition.profiles
     rows = _rows_per_sample(clock, samples.samples_per_slot)
     black_level = channel.estimate_black_level(samples, clock)
-    sigma = channel.estimate_sigma(samples, black_level, 0.5 * noise_of(profiles) / rows**0.5)
+    min_sigma = 0.5 * noise_of(profiles) / rows**0.5
+    sigma = dark_sigma(samples.light, samples.valid, black_level, min_sigma)
     return channel.ObservationModel(
         black_level=black_level,
         noise=NoiseModel(sigma**2, profiles.noise_slope / max(float(np.median(profiles.count)), 1.0) / rows),

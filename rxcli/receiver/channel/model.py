@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import NORMAL_MEDIAN
-from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, sees_dark_header
 from rxcli.types import Clock, Float32Array, SlotSamples
 
@@ -73,14 +71,3 @@ def estimate_black_level(samples: SlotSamples, clock: Clock) -> float:
     dark = sees_dark_header(places % clock.packet_slots, clock.exposure_slots, min_reach=0.5)
     observed = samples.light[..., dark][samples.valid[..., dark] > 0]
     return float(np.median(observed)) if observed.size else 0.0
-
-
-def estimate_sigma(samples: SlotSamples, black_level: float, min_sigma: float) -> float:
-    """Estimate the noise of a dark sample from second differences in dark parts; at least `min_sigma`."""
-    light = samples.light
-    mean = (light[..., 2:] + light[..., 1:-1] + light[..., :-2]) / 3
-    dark = (mean < black_level + SETTINGS.dark_light) & (samples.valid[..., 2:] * samples.valid[..., :-2] > 0)
-    second_difference = (light[..., 2:] - 2 * light[..., 1:-1] + light[..., :-2])[dark]
-    if second_difference.size < 50:
-        return min_sigma
-    return max(float(np.median(np.abs(second_difference)) / (NORMAL_MEDIAN * np.sqrt(6.0))), min_sigma)

@@ -12,8 +12,6 @@ class ChannelSettings:
     #: Effective number of independent samples per slot and strip, since their errors are correlated. The confidence
     #: model was fitted with it.
     slot_information: float = 0.64
-    #: Largest light above black, relative to white, of a sample that counts as dark when noise is measured.
-    dark_light: float = 0.001
 
     #: Slots on each side from which the picture is predicted, fine texture to plain sky. The initial pass leaves out
     #: the finest.

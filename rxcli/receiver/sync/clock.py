@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import TINY, folded, header_correlation, peak_offset
 from rxcli.protocol import EXTREMES_SLOTS, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
-from rxcli.receiver.light import take_places
+from rxcli.receiver.light import dark_sigma, take_places
 from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
+
+#: Percentile of the light that counts as black.
+_BLACK_PERCENT = 2
 
 
 def binned_strips(profiles: RowProfiles) -> RowProfiles:
@@ -138,6 +141,19 @@ def contrast(
     return value.sum(axis=1) / (total + np.float32(TINY)), total
 
 
+def header_contrast(light: Float32Array, valid: Float32Array, min_sigma: float) -> tuple[Float32Array, Float32Array]:
+    """As `contrast`, for the search for headers: faint strips count less, and noise is at least that of dark samples.
+
+    Row noise is common to the pixels of a strip, so that their variance does not show it.
+    """
+    some, is_valid = light[:, :1], valid[:, :1]  # One strip of a column is enough.
+    if is_valid.any():
+        min_sigma = dark_sigma(some, is_valid, float(np.percentile(some[is_valid > 0], _BLACK_PERCENT)), min_sigma)
+    pooled, weight = contrast(light, valid, SETTINGS.search_samples, min_sigma)
+    weight *= weight / np.float32(light.shape[1])
+    return pooled, weight
+
+
 def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot: int) -> FloatArray:
     """(C, n) float64 correlation of every column with a header that starts at each sample.
 
@@ -169,7 +185,7 @@ def find_clock(
     if n < SLOTS_PER_SYMBOL * SETTINGS.search_samples:
         return None
     light, valid = resample(profiles, top, step, n)
-    pooled, weight = contrast(light, valid, SETTINGS.search_samples, sigma / np.sqrt(max(step, 1.0)))
+    pooled, weight = header_contrast(light, valid, sigma / np.sqrt(max(step, 1.0)))
     response = header_response(pooled, weight, SETTINGS.search_samples)
     period = packet_slots * SETTINGS.search_samples
     power = folded(np.maximum(response.mean(axis=0), 0) ** 2, period)
@@ -356,19 +372,22 @@ def copy_similarity(llr: Float32Array, clock: Clock) -> FloatArray:
 def similarity(copy_a: NDArray[np.floating], copy_b: NDArray[np.floating]) -> float:
     """Log-likelihood ratio of two copies being the same packet against different ones.
 
-    Two slots lit with probabilities p and q are equal with likelihood p q / r + (1 - p)(1 - q) / (1 - r) relative to
-    independent slots, where r is the column's share of lit slots. At an edge of the picture a slot is misread in all
+    A slot decided with reliability p, right or erased, and one with q are equal with likelihood
+    1 + p q (a - r)(b - r) / (r (1 - r)) relative to independent slots, where a and b are 1 if lit and r is the column's
+    share of lit slots: slots without light count neither way. At an edge of the picture a slot is misread in all
     columns together: a slot counts for little, whatever its columns show.
 
     Args:
         copy_a: (C, packet) log-likelihood ratio of each slot being lit, 0 where not visible.
         copy_b: likewise.
     """
-    llr_a, llr_b = copy_a[:, PREAMBLE_SLOTS:], copy_b[:, PREAMBLE_SLOTS:]
-    common = (llr_a != 0) & (llr_b != 0)
-    p, q = 1 / (1 + np.exp(-llr_a)), 1 / (1 + np.exp(-llr_b))
-    share = ((p + q) * common).sum(axis=1, keepdims=True) / np.maximum(2 * common.sum(axis=1, keepdims=True), 1)
-    share = np.clip(share, WEIGHTS[0] / SLOTS_PER_SYMBOL, WEIGHTS[-1] / SLOTS_PER_SYMBOL)
-    of_slots = (np.log(p * q / share + (1 - p) * (1 - q) / (1 - share)) * common).sum(axis=0)
+    soft = np.tanh(np.stack([copy_a[:, PREAMBLE_SLOTS:], copy_b[:, PREAMBLE_SLOTS:]]) / 2)
+    by_slot = np.abs(soft).mean(axis=1)
+    soft *= (by_slot > SETTINGS.min_slot_light * by_slot.max())[:, None]
+    decided = np.abs(soft).sum(axis=(0, 2)) + TINY
+    share = np.maximum(soft, 0).sum(axis=(0, 2)) / decided
+    share = np.clip(share, WEIGHTS[0] / SLOTS_PER_SYMBOL, WEIGHTS[-1] / SLOTS_PER_SYMBOL)[:, None]
+    off_a, off_b = soft * np.where(soft > 0, 1 - share, share)
+    of_slots = np.log(np.maximum(1 + off_a * off_b / (share * (1 - share)), TINY)).sum(axis=0)
     right, misread = np.log(1 - SETTINGS.misread_slots), np.log(SETTINGS.misread_slots)
     return float((np.logaddexp(right + of_slots, misread) - np.logaddexp(right, misread + of_slots)).sum())

@@ -32,6 +32,8 @@ class SyncSettings:
 
     #: Limit of a slot's log-likelihood ratio when copies are compared.
     max_slot_llr: float = 3.0
+    #: Reliability of a slot, mean of the columns, as a share of the most reliable one's, below which it shows no light.
+    min_slot_light: float = 0.3
     #: Share of the slots that are misread in all columns of a copy.
     misread_slots: float = 0.1
     #: Log-likelihood ratio at which the phase of the bursts is settled.

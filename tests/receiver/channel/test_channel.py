@@ -13,7 +13,7 @@ from rxcli.protocol import slot_patterns
 from rxcli.receiver import channel
 from rxcli.receiver.channel.patterns import by_pattern
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
-from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Clock, SlotSamples
 
@@ -121,9 +121,9 @@ def test_sigma_is_the_noise_of_a_dark_sample() -> None:
     for sigma in (0.0005, 0.002):
         shot_gain = Shot(rows_per_slot=16.0, n_rows=3000, level=2e-4, sigma=sigma)
         _, _, samples, model = scene(shot_gain, seed=2)
-        found = channel.estimate_sigma(samples, shot_gain.ambient, 1e-6)
+        found = dark_sigma(samples.light, samples.valid, shot_gain.ambient, 1e-6)
         assert found == pytest.approx(model.noise.sigma, rel=0.2)
-        assert channel.estimate_sigma(samples, shot_gain.ambient, 1.0) == 1.0
+        assert dark_sigma(samples.light, samples.valid, shot_gain.ambient, 1.0) == 1.0
 
 
 CLEAN = {
@@ -230,7 +230,7 @@ def test_hostile_light_gives_finite_likelihoods(kind: str, is_initial: bool, ide
     _, now, samples, _ = scene(Shot(), seed=7)
     samples = hostile(kind, samples)
     black_level = channel.estimate_black_level(samples, now)
-    sigma = channel.estimate_sigma(samples, black_level, 1e-5)
+    sigma = dark_sigma(samples.light, samples.valid, black_level, 1e-5)
     model = model_for(Shot(), sigma, black_level)
     lit = np.full((6, now.n_slots), idea, np.float32)
     contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)

@@ -13,7 +13,7 @@ from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_o
 from rxcli.protocol import encode_packet
 from rxcli.receiver import channel
 from rxcli.receiver.decode import detect
-from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, slot_llr
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma, slot_llr
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import BurstPosteriors, Clock, RowProfiles, SlotSamples
 
@@ -43,7 +43,7 @@ def received(
     floor = channel.estimate_black_level(samples, clock_)
     model = channel.ObservationModel(
         black_level=floor,
-        noise=NoiseModel(channel.estimate_sigma(samples, floor, 1e-4) ** 2, 0.0),
+        noise=NoiseModel(dark_sigma(samples.light, samples.valid, floor, 1e-4) ** 2, 0.0),
         crosstalk=Crosstalk(np.tile([shot.crosstalk, 1.0, shot.crosstalk], (shot.n_strips, 1))),
         exposure=Exposure.of(shot.exposure_slots, Q),
     )
@@ -117,6 +117,35 @@ def test_copies_are_given_to_their_bursts(phase: int) -> None:
     assert (clock_.burst == true_burst - true_burst[0]).all()
     shown = np.bincount(clock_.burst, minlength=2) >= 2
     assert right_packets(posteriors, link, int(true_burst[0]))[np.flatnonzero(shown)].all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rows_without_light_hold_no_header(seed: int) -> None:
+    """A window on a dark desktop: most rows show row noise alone, which the spread of their pixels does not tell."""
+    rng = np.random.default_rng([seed, 3])
+    link = random_link(rng, [7] * 20, 5)
+    shot = Shot(start_slot=20.0, n_rows=1200, sigma=1e-5)
+    profiles = row_profiles(link, shot, rng)
+    row = np.arange(shot.n_rows)
+    light = np.where((row > 250) & (row < 640), profiles.light, np.float32(shot.ambient))
+    light += rng.normal(0, 1e-3, shot.n_rows).astype(np.float32)
+    found = found_clock(replace(profiles, light=light), shot, link.packet_slots)
+    assert abs(start_error(found, shot)) < 0.3
+    assert not found.delay_slots.any()
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_slots_without_light_neither_join_nor_separate_copies(same: bool) -> None:
+    rng = np.random.default_rng(2)
+    sent = rng.random((2, 20, 150)) < 0.8
+    first, second = np.where(sent, 5.0, -5.0)[[0, 0 if same else 1]]
+    whole = sync.similarity(first, second)
+    second[:, 60:] = rng.normal(0, 0.2, second[:, 60:].shape)  # the screen is dark there
+    part, lit = sync.similarity(first, second), sync.similarity(first[:, :60], second[:, :60])
+    assert (whole > 100) == same
+    assert (part > 30) == same
+    assert abs(part - lit) < 5
+    assert abs(sync.similarity(first, rng.normal(0, 0.2, first.shape))) < abs(lit) / 4
 
 
 @pytest.mark.parametrize("seed", range(4))
