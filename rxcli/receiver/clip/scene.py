@@ -142,7 +142,9 @@ class TrackedScreen:
         contrast, clock = with_contrast(0.0)
         if contrast < SETTINGS.good_header:
             slots = np.arange(-time.sure_slots, time.sure_slots + SETTINGS.clock_step, SETTINGS.clock_step)
-            contrast, clock = max(map(with_contrast, slots.tolist()), key=itemgetter(0))
+            best = max(map(with_contrast, slots.tolist()), key=itemgetter(0))
+            if best[0] > contrast + SETTINGS.header_lead:  # A sliver of a header fits nearly as well elsewhere.
+                contrast, clock = best
         return clock if contrast >= SETTINGS.min_header else None
 
     # -- where the screen is -------------------------------------------------------------------------------------------

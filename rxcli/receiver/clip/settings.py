@@ -38,8 +38,10 @@ class ClipSettings:
     exposure_change: float = 0.3
     #: Share of a frame's noise in what is expected of the next.
     frame_share: float = 0.2
-    #: Contrast of its headers at which the predicted clock is accepted; and steps of the search near it, slots.
+    #: Contrast of its headers at which the predicted clock is accepted; lead of one that replaces it below that; and
+    #: steps of the search near it, slots.
     good_header: float = 0.6
+    header_lead: float = 0.1
     clock_step: float = 0.5
     #: Variance of a strip's light, at least: that of a starved clip's dark parts is none.
     min_variance: float = 1e-7
