@@ -37,6 +37,8 @@ class Outline:
     family: int = 0
     #: Whether light reaches to both ends of the picture.
     fills: bool = False
+    #: Whether its columns are plain; if not, only packets show that it is a screen.
+    stands_out: bool = True
     #: Strips of the picture on which it was found; None where it was given.
     strips: Strips | None = field(default=None, repr=False, compare=False)
     #: Estimated lens that bends the columns; used where the camera has no known lens.

@@ -38,14 +38,27 @@ def proposed_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
         return refused
     if options.corners is not None:
         with timer("geometry"):
-            return outside_the_picture(options.corners, frame) or [[Outline(options.corners)]]
+            return outside_the_picture(options.corners, frame) or [[_given(options.corners, frame, options, timer)]]
     found = possible_screens(frame, options, timer)
     if found:
         return found
-    reason = turned_pixels(frame, options, timer) or reason_for_none(frame)  # Pixels may lie on their side.
     if "no_screen" in options.skip or not may_fill(frame):
-        return Failure("no_screen", f"no screen found: {reason}")
+        return no_screen(frame, options, timer)
     return [[Outline(whole_picture(frame), inferred=geometry.SIDE_NAMES, column_offset=None)]]
+
+
+def no_screen(frame: Frame, options: ReceiverOptions, timer: Timer) -> Failure:
+    """Failure of a picture without a screen."""
+    reason = turned_pixels(frame, options, timer) or reason_for_none(frame)  # Pixels may lie on their side.
+    return Failure("no_screen", f"no screen found: {reason}")
+
+
+def _given(corners: FloatArray, frame: Frame, options: ReceiverOptions, timer: Timer) -> Outline:
+    """The outline that a user gave, with the number of columns if they are narrow."""
+    narrow = [layout.n_columns for layout in layouts_of(options) if layout.is_narrow]
+    if len(narrow) != 1 or len(options.screens) == 1:
+        return Outline(corners)
+    return Outline(corners, n_columns=narrow[0] if find.shows_narrow(timer.planes.plane(frame)) else None)
 
 
 def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> list[list[Outline]]:
@@ -63,8 +76,9 @@ def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
             candidate.corners,
             inferred=candidate.unlit_sides,
             log_odds=candidate.log_odds,
-            family=candidate.layout.n_columns,
+            family=candidate.family,
             fills=candidate.fills,
+            stands_out=candidate.stands_out,
             strips=candidate.strips,
             lens=candidate.grid.estimated_lens,
             n_columns=None if is_usual else candidate.layout.n_columns,
@@ -73,7 +87,8 @@ def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
 
     outlines = [[outline(candidate) for candidate in screen] for screen in screens]
     if len(outlines) == 1 and bright is not None:
-        own = Outline(bright, _BRIGHT_CERTAINTY, log_odds=_BRIGHT_LOG_ODDS, family=0)
+        # The picture on the screen may show borders that are none of the columns'.
+        own = Outline(bright, _BRIGHT_CERTAINTY, log_odds=_BRIGHT_LOG_ODDS, family=-1)
         own = _as_viewed(own, frame.metadata.orientation)
         tolerance = _SAME_OUTLINE * np.ptp(bright[:, 0])
         if all(np.abs(outline.corners - own.corners).max() >= tolerance for outline in outlines[0]):
@@ -144,7 +159,8 @@ def whole_picture(frame: Frame) -> FloatArray:
 def turned_pixels(frame: Frame, options: ReceiverOptions, timer: Timer) -> str | None:
     """Message about a picture that was rotated by 90 degrees, or None. Of a clip only the first frame is examined."""
     wide = [layout for layout in layouts_of(options) if not layout.is_narrow]
-    if frame.index or not find.find_screens(turned(timer.planes.plane(frame)), wide):
+    screens = [] if frame.index else find.find_screens(turned(timer.planes.plane(frame)), wide)
+    if not any(screen[0].stands_out for screen in screens):
         return None
     return (
         "the picture was turned by 90 degrees after it was taken, or taken in portrait: its stripes run downwards; use "

@@ -17,7 +17,7 @@ from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.context import Failure, Outline, Timer
-from rxcli.receiver.corners import proposed_screens, too_small
+from rxcli.receiver.corners import no_screen, proposed_screens, too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.reception import Reception, headerless, soft_bits
 from rxcli.receiver.search import search
@@ -95,6 +95,8 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
     if isinstance(screens, Failure):
         return failed(FrameResult(frame.source, frame.index, frame.time_s, "ok"), screens)
     results = [_receive_screen(frame, outlines, options, timer) for outlines in screens]
+    if not screens[0][0].stands_out and not results[0].packets:
+        return failed(FrameResult(frame.source, frame.index, frame.time_s, "ok"), no_screen(frame, options, timer))
     results.sort(key=lambda result: -sum(packet.is_believable for packet in result.packets))
     return replace(results[0], other_screens=tuple(result for result in results[1:] if result.packets))
 

@@ -20,7 +20,7 @@ from rxcli.receiver import channel, still
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.context import Timer
 from rxcli.receiver.decode import detect
-from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.receiver.pipeline import ReceiverOptions, receive, receive_frame
 from rxcli.receiver.reception import headerless
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.still import initial_pass
@@ -510,3 +510,12 @@ def test_stripes_of_few_rows_are_no_error(period_rows: int) -> None:
     corners = np.array([[0.5, 0.5], [958.5, 0.5], [958.5, 538.5], [0.5, 538.5]])
     (result,) = receive([frame], ReceiverOptions(cameras=(), corners=corners))
     assert all(packet.confidence < 0.5 for column in result.columns for packet in column.packets)
+
+
+def test_corners_of_a_hundred_columns_need_no_screen() -> None:
+    """Columns of twenty would show headers, too, as all columns share them."""
+    trial = simulate_trial(preset("xs10-still", "wide-100").scaled(0.6, keep_readout=True), 3)
+    result = receive_frame(trial.frame, ReceiverOptions(corners=trial.corners))
+    assert result.screen_profile == "wide-100"
+    sent = {(column, text) for burst in trial.truth.payload.values() for column, text in enumerate(burst)}
+    assert len({(column.column, p.payload) for column in result.columns for p in column.packets} & sent) > 70

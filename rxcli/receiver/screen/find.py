@@ -1,7 +1,7 @@
 """The finder: propose outlines of the screen in a picture, from the coherence of strips alone.
 
-No side of the screen has to be visible. Strips (`strips`) give combs of borders (`combs`). The comb whose waveforms
-explain the light best becomes a grid of columns (`grid`, `waveforms`). Light outside the screen and columns out of view
+No side of the screen has to be visible. Strips (`strips`) give combs of borders (`combs`). The combs whose waveforms
+explain the light best become grids of columns (`grid`, `waveforms`). Light outside the screen and columns out of view
 identify the first column (`numbering`); light along the columns gives the first and last rows (`rows`). The finder
 proposes outlines with log-odds and leaves the decision to the search.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import find_combs, grid_of_comb
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
-from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
+from rxcli.receiver.screen.numbering import LightProfile, centred_film, first_columns, light_profile
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.strips import Strips, read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
@@ -33,9 +34,14 @@ _NARROW_COLUMNS, _PARTS = 50, 5
 _REACH_GAIN = 1.4
 #: Steps of a grid on some of the windows, and last steps on all windows.
 _FIRST_STEPS, _LAST_STEPS = 3, 2
-#: Weight of the log-likelihood that borders add, relative to that of the light that waveforms explain; and the contrast
-#: of the strongest comb, as a share of the light it explains, from which no further combs are tried.
-_CONTRAST_WEIGHT, _PLAIN_CONTRAST = 1.5, 0.15
+#: Contrast of the strongest comb, as a share of the light it explains, from which no further combs are tried; number of
+#: combs that are fitted otherwise.
+_PLAIN_CONTRAST, _N_FITTED = 0.2, 3
+#: Contrast, times what chance gives, from which packets are looked for; of a part of a picture it must be plainer.
+_POSSIBLE_CONTRAST = 0.5
+#: Share of the best grid's score from which a second one is proposed, and its log-odds: it is right in one picture of
+#: ten; mean distance from which grids differ, columns.
+_NEARLY_BEST, _SECOND, _DIFFERENT = 0.98, -25.0, 0.2
 #: Log-odds relative to the likeliest first column down to which another one is possible.
 _MIN_LOG_ODDS = -7.0
 #: JPEG codes blocks of pixels, whose borders look like those of narrow columns: their width, and its tolerance.
@@ -73,10 +79,14 @@ class OutlineCandidate:
     layout: ColumnLayout
     #: Log-odds of its first column and number of columns relative to the likeliest.
     log_odds: float
+    #: Candidates of one family differ only in the first column.
+    family: int
     #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
     fills: bool
     #: Sides of the stored picture at which no light shows.
     unlit_sides: tuple[str, ...]
+    #: Whether the columns' borders stand out by more than chance.
+    stands_out: bool
 
 
 def find_screens(
@@ -108,16 +118,24 @@ def find_screens(
     if not wide:
         return []
     size = (plane.width, plane.height)
-    rival = None if bright is None else grid_between(bright, wide[0].n_columns, size, lens)
-    grid = wide_grid(strips, wide[0].sigma, rival)
-    return [] if grid is None else [_numbered(strips, grid, wide)]
+    rivals = [] if bright is None else [grid_between(bright, wide[0].n_columns, size, lens)]
+    grids = wide_grids(strips, wide[0].sigma, rivals, _POSSIBLE_CONTRAST)
+    found = [candidate for rank, grid in enumerate(grids) for candidate in _numbered(strips, grid, wide, rank)]
+    return [sorted(found, key=lambda candidate: -candidate.log_odds)] if found else []
+
+
+def shows_narrow(plane: LightPlane) -> bool:
+    """Whether the columns in a picture are narrow."""
+    if min(plane.width, plane.height) < MIN_SIZE_PX:
+        return False
+    strips = read_strips(plane)
+    return strips.lit.shape[1] >= _MIN_STRIPS and shows_narrow_columns(strips.without_common_light())
 
 
 def _screens_apart(strips: Strips, layouts: Sequence[ColumnLayout]) -> list[list[OutlineCandidate]]:
     """Candidate outlines of two screens side by side, or none: together they light more columns than one has."""
     sides = strips.sides_of_gap()
-    grids = [wide_grid(side, layouts[0].sigma) for side in sides]
-    found = [(side, grid) for side, grid in zip(sides, grids, strict=True) if grid is not None]
+    found = [(side, grid) for side in sides for grid in wide_grids(side, layouts[0].sigma)[:1]]
     n_lit = sum(np.ptp(_light_across(side, grid, layouts[0].sigma)[1].ends) for side, grid in found)
     if len(found) < 2 or n_lit < max(layout.n_columns for layout in layouts) + 1:
         return []
@@ -167,32 +185,39 @@ def follow_outline(plane: LightPlane, corners: FloatArray, layout: ColumnLayout)
     return flat.corners(flat.ends_of(corners) if has_bars else ends)  # With bars the rows are where they were.
 
 
-def wide_grid(strips: Strips, sigma: float, rival: Grid | None = None) -> Grid | None:
-    """The grid of wide columns that explains the strips' light best, or None.
+def wide_grids(strips: Strips, sigma: float, rivals: Sequence[Grid] = (), least: float = 1.0) -> list[Grid]:
+    """The grid of wide columns that explains the strips' light best, and one that does nearly as well, if any.
 
     Args:
         strips: of the picture.
         sigma: light spread of the screen, column pitches.
-        rival: a grid that competes with those of the combs, unless the strongest comb's is plain.
+        rivals: grids that compete with those of the combs, unless the strongest comb's is plain.
+        least: minimum contrast, times what chance gives.
     """
     some, combs = strips.blocks(slice(None, None, 2)), find_combs(strips, sigma)
-    grids = (with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs)
-    starts: list[Grid] = []
-    if (strongest := next(grids, None)) is not None:
-        if strongest.contrast > _PLAIN_CONTRAST * strongest.explained:
-            strongest = moved_by_waveforms(some, strongest, sigma, _FIRST_STEPS)
-            return moved_by_waveforms(strips, strongest, sigma, _LAST_STEPS)
-        best = max([strongest, *grids], key=_score)
-        starts.append(moved_by_waveforms(some, best, sigma, _FIRST_STEPS))
-    starts += [rival] if rival is not None and with_light(some, rival, sigma).contrast > 0 else []
-    moved = [moved_by_waveforms(strips, grid, sigma, _LAST_STEPS) for grid in starts]
-    settled = [with_light(strips, grid, sigma) for grid in moved]
-    return max((grid for grid in settled if _stands_out(strips, grid)), key=_score, default=None)
+    starts = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[:1]]
+    if not starts or starts[0].contrast < _PLAIN_CONTRAST * starts[0].explained:
+        starts += [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
+        starts = sorted(starts, key=_score, reverse=True)[:_N_FITTED]
+        starts += [rival for rival in rivals if with_light(some, rival, sigma).contrast > 0]
+    near = [moved_by_waveforms(some, grid, sigma, _FIRST_STEPS) for grid in starts]
+    fitted = [with_light(strips, moved_by_waveforms(strips, grid, sigma, _LAST_STEPS), sigma) for grid in near]
+    found = sorted((grid for grid in fitted if _stands_out(strips, grid, least)), key=_score, reverse=True)
+    second = (
+        grid for grid in found[1:] if _score(grid) > _NEARLY_BEST * _score(found[0]) and _differ(strips, grid, found[0])
+    )
+    return [*found[:1], *islice(second, 1)]
 
 
 def _score(grid: Grid) -> float:
     """Log-likelihood by which grids are compared."""
-    return grid.explained + _CONTRAST_WEIGHT * grid.contrast
+    return grid.explained + grid.contrast
+
+
+def _differ(strips: Strips, grid: Grid, rival: Grid) -> bool:
+    """Whether two grids differ in more than the number of the first column."""
+    off = columns_at(grid.numbers, strips.x, strips.y) - columns_at(rival.numbers, strips.x, strips.y)
+    return bool(np.abs(off - np.round(np.median(off))).mean() > _DIFFERENT)
 
 
 def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
@@ -222,29 +247,34 @@ def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
     return grid
 
 
-def _stands_out(strips: Strips, grid: Grid) -> bool:
-    """Whether borders half a column further on explain less, by more than chance."""
+def _stands_out(strips: Strips, grid: Grid, least: float = 1.0) -> bool:
+    """Whether borders half a column further on explain less, by `least` times what chance gives."""
     by_chance = grid.explained / np.sqrt(strips.picture_rows)
-    return bool(grid.contrast > by_chance)
+    return bool(grid.contrast > least * by_chance)
 
 
-def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout]) -> list[OutlineCandidate]:
+def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout], rank: int = 0) -> list[OutlineCandidate]:
     """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
     light, profile = _light_across(strips, grid, layouts[0].sigma)
+    stands_out = _stands_out(strips, grid)
     found: list[OutlineCandidate] = []
-    for layout in layouts:
+    for family, layout in enumerate(layouts, rank * len(layouts)):
         columns, odds, fills = first_columns(profile, layout.n_columns)
         best, n = int(columns[odds.argmax()]), layout.n_columns
         own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, _LAST_STEPS, n_columns=n)
         plane, ends, has_bars = find_rows(strips, light, own, n, layout.aspect)
+        if not has_bars:
+            odds = odds + centred_film(profile, columns, n)
         for number, log_odds in zip(columns.tolist(), odds.tolist(), strict=True):
             if log_odds > odds.max() + _MIN_LOG_ODDS:
                 corners, counted = plane.corners(ends, number - best), own.shifted(number - best)
                 unlit = (profile.ends[0] - number, number + n - profile.ends[1])
                 sides = _unlit_sides(corners, unlit, has_bars, (strips.width, strips.height))
-                found.append(OutlineCandidate(corners, strips, counted, layout, log_odds, fills, sides))
+                found.append(
+                    OutlineCandidate(corners, strips, counted, layout, log_odds, family, fills, sides, stands_out)
+                )
     likeliest = max(candidate.log_odds for candidate in found)
-    found = [replace(candidate, log_odds=candidate.log_odds - likeliest) for candidate in found]
+    found = [replace(candidate, log_odds=candidate.log_odds - likeliest + rank * _SECOND) for candidate in found]
     return sorted(found, key=lambda candidate: -candidate.log_odds)
 
 

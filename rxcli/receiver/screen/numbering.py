@@ -26,8 +26,8 @@ _GREY_LEVEL, _STEADY, _MAX_STEADY = 255.0**-2, 1.0, 3.0
 _ENDS = 0.05
 #: Log-odds of each column outside the picture, and their minimum at ends of the picture that light reaches.
 _OUTSIDE, _LARGER = -4.0, -3.0
-#: Standard deviation of the light's middle about the screen's middle, screen widths.
-_LIGHT_SD = 0.175
+#: Standard deviations of the light's middle and of the picture's about the screen's middle, screen widths.
+_LIGHT_SD, _AIM_SD = 0.175, 0.12
 #: Columns of the picture that must lie beyond light which ends in the picture.
 _IN_VIEW = 0.3
 #: Light begins at a border if the log-odds inside exceed this and those beyond stay below this share of them; log-odds
@@ -50,9 +50,12 @@ class LightProfile:
     in_picture: BoolArray
     #: (P,) log-odds that a part is on the screen.
     log_odds: FloatArray
-    #: First and last column of each thing whose middle is probably the screen's: a bright picture with dark on both
-    #: sides, and the screen with its frame in a lighted room.
-    spans: tuple[tuple[float, float], ...]
+    #: Column at the picture's middle.
+    picture_middle: float
+    #: First and last column of what probably has its middle at the screen's, or None: a bright picture with dark on
+    #: both sides, if it is as high as the screen; and the screen with its frame in a lighted room.
+    film: tuple[float, float] | None
+    frame: tuple[float, float] | None
 
     @property
     def ends(self) -> tuple[float, float]:
@@ -88,8 +91,8 @@ def light_profile(strips: Strips, light: Float32Array, grid: Grid) -> LightProfi
     odds -= _PART_COUNTS * steady
     place = origin + (np.arange(n) + 0.5) / _PARTS
     by_block = np.maximum(light.mean(axis=(1, 2)), 0.0)
-    spans = _film(np.where(by_block[:, None] > 0, strips.level, 0), u), _framed(place, odds, steady)
-    return LightProfile(place, count > 0, np.where(count > 0, odds, 0.0), tuple(filter(None, spans)))
+    film, frame = _film(np.where(by_block[:, None] > 0, strips.level, 0), u), _framed(place, odds, steady)
+    return LightProfile(place, count > 0, np.where(count > 0, odds, 0.0), float(grid.numbers[0]), film, frame)
 
 
 def _steady_light(strips: Strips, part: IntArray, odds: FloatArray) -> FloatArray:
@@ -155,13 +158,25 @@ def first_columns(light: LightProfile, n_columns: int) -> tuple[IntArray, FloatA
     reaches = np.array([begin < left + _IN_VIEW, end_of_light > right - _IN_VIEW])
     off = (begin + end_of_light) / 2 - middles
     odds = _light_within(light, starts, ends) - 0.5 * np.square(off / (_LIGHT_SD * n_columns))
+    if not reaches.any():
+        odds -= 0.5 * np.square((light.picture_middle - middles) / (_AIM_SD * n_columns))
     hidden = np.maximum(np.stack([left - starts, ends - right]), 0.0)
     odds += _OUTSIDE * (~reaches @ hidden) + np.maximum(_OUTSIDE * (reaches @ hidden), _LARGER)
     odds += _ON_BORDER * (_begins(light, starts, 1) + 1.0 * _begins(light, ends, -1))
-    for span in light.spans:
-        if span[1] - span[0] < _MAX_SPAN * n_columns:
-            odds += _CENTRED * (np.abs(sum(span) / 2 - middles) < _IN_MIDDLE)
-    return starts, odds, bool(reaches.all())
+    return starts, odds + _centred(light.frame, starts, n_columns), bool(reaches.all())
+
+
+def centred_film(light: LightProfile, starts: IntArray, n_columns: int) -> FloatArray:
+    """Log-odds (F,) that a bright picture as high as the screen adds to columns that may be the screen's first."""
+    return _centred(light.film, starts, n_columns)
+
+
+def _centred(span: tuple[float, float] | None, starts: IntArray, n_columns: int) -> FloatArray:
+    """Log-odds (F,) that a span of columns adds where its middle is the screen's."""
+    if span is None or span[1] - span[0] >= _MAX_SPAN * n_columns:
+        return np.zeros(starts.size)
+    is_centred = np.abs(sum(span) / 2 - starts - n_columns / 2) < _IN_MIDDLE
+    return np.where(is_centred, _CENTRED, 0.0)
 
 
 def _begins(light: LightProfile, borders: IntArray, side: int) -> BoolArray:

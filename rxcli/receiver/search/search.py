@@ -55,7 +55,7 @@ def search(
             return screens
         outlines = screens[0]
     proposer = Proposer(frame, options, timer, tuple(outlines), known)
-    walk = _Walk(proposer, budget)
+    walk = _Walk(proposer, budget if outlines[0].stands_out else SETTINGS.doubtful_budget)
     best = walk.run()
     min_evidence = SETTINGS.bail if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
     if best is None or best.evidence < min_evidence:

@@ -22,8 +22,9 @@ class SearchSettings:
     #: Below this evidence an estimated camera is rejected; above the second no other one is proposed.
     few_packets: float = 40.0
     plain_estimate: float = 100.0
-    #: Maximum number of initial passes of a frame, and of initial passes without any evidence.
+    #: Maximum number of initial passes of a frame; if its columns do not stand out; and without any evidence.
     budget: int = 24
+    doubtful_budget: int = 3
     hopeless_budget: int = 8
     #: Siblings of a scored hypothesis get a pass if their score could come this near to the best one.
     reach: float = 3.0

@@ -20,10 +20,10 @@ from rxcli.receiver.screen.find import (
     find_screens,
     follow_outline,
     why_useless,
-    wide_grid,
+    wide_grids,
 )
 from rxcli.receiver.screen.grid import columns_at, grid_between
-from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
+from rxcli.receiver.screen.numbering import LightProfile, centred_film, first_columns, light_profile
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.screen.rows import lit_range
 from rxcli.receiver.screen.strips import read_strips, shows_narrow_columns
@@ -265,10 +265,24 @@ def test_a_rival_replaces_missing_combs_where_borders_show(monkeypatch: pytest.M
     monkeypatch.setattr(find, "find_combs", lambda *_: [])
     strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
     x, y = strips.x, strips.y
-    reached = wide_grid(strips, 0.45, true.shifted(0.2))
-    assert reached is not None
+    (reached,) = wide_grids(strips, 0.45, [true.shifted(0.2)])
     assert np.abs(columns_at(reached.numbers, x, y) - columns_at(true.numbers, x, y)).max() < 0.3
-    assert wide_grid(strips, 0.45, true.shifted(0.5)) is None
+    assert not wide_grids(strips, 0.45, [true.shifted(0.5)])
+
+
+def test_a_second_grid_is_proposed_where_it_does_nearly_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(find, "_PLAIN_CONTRAST", 1.0)
+    monkeypatch.setattr(find, "_stands_out", lambda *_: True)
+    plane, narrower = drawn("blobs"), CORNERS.mean(axis=0) + (CORNERS - CORNERS.mean(axis=0)) * np.array([0.8, 1.0])
+    for nearly, families in ((0.99, {0}), (0.0, {0, 1})):
+        monkeypatch.setattr(find, "_NEARLY_BEST", nearly)
+        (outlines,) = find_screens(plane, [WIDE], None, narrower)
+        assert {one.family for one in outlines} == families
+        assert outlines[0].family == 0
+    second = next(one for one in outlines if one.family == 1)
+    assert second.log_odds == -25
+    off = [apart(one) - np.round(np.median(apart(one))) for one in (outlines[0], second)]
+    assert np.abs(off[0]).max() < 0.2 < np.abs(off[1]).max()
 
 
 def profile_of(picture: str) -> LightProfile:
@@ -283,18 +297,20 @@ def test_columns_with_light_are_told_from_those_without() -> None:
 
 
 def test_a_film_has_sharp_ends_and_fading_light_has_none() -> None:
-    (film,) = profile_of("film").spans
-    np.testing.assert_allclose(film, (2.6, 17.4), atol=0.3)
-    assert not profile_of("fading").spans
-    columns, log_odds, _ = first_columns(profile_of("film"), 20)
-    assert columns[log_odds.argmax()] == 0
+    light = profile_of("film")
+    np.testing.assert_allclose(light.film, (2.6, 17.4), atol=0.3)
+    assert profile_of("fading").film is None
+    columns, log_odds, _ = first_columns(light, 20)
+    assert columns[(log_odds + centred_film(light, columns, 20)).argmax()] == 0
 
 
 @pytest.mark.parametrize("film", [(0.8, 19.2), (0.6, 18.4)])
 def test_narrow_bars_on_both_sides_show_the_first_column(film: tuple[float, float]) -> None:
     place = (np.arange(-16, 22 * 8) + 0.5) / 8
     light = np.where((place > 1.5) & (place < 18.5), 2.0, 0.0)
-    columns, log_odds, _ = first_columns(LightProfile(place, np.ones(place.size, bool), light, (film,)), 20)
+    profile = LightProfile(place, np.ones(place.size, bool), light, 10.0, film, None)
+    columns, log_odds, _ = first_columns(profile, 20)
+    log_odds += centred_film(profile, columns, 20)
     in_doubt = (log_odds > log_odds.max() - 2).sum() > 1
     assert columns[log_odds.argmax()] == 0 or in_doubt
     assert in_doubt == (sum(film) != 20)
@@ -313,7 +329,9 @@ def test_steady_light_around_the_screen_shows_the_first_column() -> None:
 def test_light_that_ends_just_before_the_edge_of_the_picture_ends_on_the_screen() -> None:
     place = (np.arange(-8, 20 * 8 + 3) + 0.5) / 8
     light = np.where((place > 7) & (place < 20), 1.3, -0.1)
-    columns, log_odds, fills = first_columns(LightProfile(place, np.ones(place.size, bool), light, ()), 20)
+    columns, log_odds, fills = first_columns(
+        LightProfile(place, np.ones(place.size, bool), light, 10.0, None, None), 20
+    )
     assert columns[log_odds.argmax()] == 0
     assert not fills
 
