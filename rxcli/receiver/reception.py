@@ -12,6 +12,7 @@ from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import assemble, confidence, detect
+from rxcli.receiver.decode.settings import SETTINGS as decode_settings
 from rxcli.receiver.decode.soft_bits import assume_unobserved_certain, still_soft_bits
 from rxcli.receiver.decode.steady import is_steady
 from rxcli.receiver.settings import SETTINGS
@@ -64,7 +65,7 @@ class Reception:
     @cached_property
     def is_complete(self) -> BoolArray:
         """(B, C) packets with all payload slots observed."""
-        return assemble.complete(self.n_observed)
+        return assemble.complete(self.n_observed, decode_settings.max_missing_slots)
 
     @property
     def payload_lit(self) -> Float32Array:

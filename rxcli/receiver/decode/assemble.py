@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.protocol import PREAMBLE_SLOTS, bits_per_symbol, indices_to_bits
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, bits_per_symbol, indices_to_bits
 from rxcli.receiver.decode.confidence import BurstInClip, Quality, clip_quality, still_quality
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import (
@@ -154,8 +154,10 @@ def _burst(
             strict=True,
         )
     ]
-    echo = complete(n_observed) & echoes(posteriors, snr_db)[place]
-    possible = complete(n_observed) & ~echo & (quality.ber_hat[place] <= SETTINGS.max_ber_hat)
+    # In a clip, a later frame shows what is missing.
+    whole = complete(n_observed, 0 if frames else SETTINGS.max_missing_slots)
+    echo = whole & echoes(posteriors, snr_db)[place]
+    possible = whole & ~echo & (quality.ber_hat[place] <= SETTINGS.max_ber_hat)
     return _Burst(packets, posteriors.w, n_observed, echo, possible)
 
 
@@ -227,9 +229,9 @@ def _withheld(confidence: float, min_confidence: float) -> str | None:
 
 def _incomplete_reason(n_observed: IntArray) -> str | None:
     """Message for a column without a complete packet, or None; `n_observed` is (B, packet)."""
-    missing = int((n_observed[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
-    if not missing:
+    if complete(n_observed, SETTINGS.max_missing_slots).any():
         return None
+    missing = int((n_observed[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
     return (
         f"no packet is in view as a whole: of {n_observed.shape[1]} slots {missing} are missing; move closer so that "
         "the screen fills more of the height, or take another picture"
@@ -285,9 +287,13 @@ def slots_observed(samples: SlotSamples, clock: Clock) -> IntArray:
     return np.stack([by_copy[:, clock.burst == burst].sum(axis=1) for burst in range(int(clock.burst.max()) + 1)])
 
 
-def complete(n_observed: IntArray) -> BoolArray:
-    """(..., C) whether every payload slot was observed, from the counts (..., C, packet) of `slots_observed`."""
-    return np.asarray((n_observed[..., PREAMBLE_SLOTS:] > 0).all(axis=-1))
+def complete(n_observed: IntArray, max_missing: int = 0) -> BoolArray:
+    """(..., C) whether the payload was observed, from the counts (..., C, packet) of `slots_observed`.
+
+    A symbol may miss up to `max_missing` slots: its weight is known, so that mostly one word fits the rest.
+    """
+    missing = (n_observed[..., PREAMBLE_SLOTS:] == 0).reshape(*n_observed.shape[:-1], -1, SLOTS_PER_SYMBOL)
+    return np.asarray((missing.sum(axis=-1) <= max_missing).all(axis=-1))
 
 
 def echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolArray:

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 class DecodeSettings:
     """Thresholds, each with its unit and its reason."""
 
+    #: Maximum number of slots that a symbol of a photograph's packet may miss.
+    max_missing_slots: int = 2
     #: Largest expected share of wrong bits of a reported packet.
     max_ber_hat: float = 0.1
     #: If no packet of a photograph reaches this confidence, none is reported.

@@ -135,12 +135,12 @@ def test_a_payload_slot_that_was_never_seen_is_no_packet() -> None:
 def test_slots_off_the_screen_are_not_seen() -> None:
     clock, samples = clock_of(60, 0, [0, 0]), samples_of(60)
     valid = samples.valid.copy()
-    valid[0, :, 30 * Q : 32 * Q] = 0
-    valid[1, 0, 30 * Q : 32 * Q] = 0
+    valid[0, :, 30 * Q : 33 * Q] = 0
+    valid[1, 0, 30 * Q : 33 * Q] = 0
     samples = replace(samples, valid=valid)
     columns = results_of(clock, posteriors_of([5, 5], indices([5, 5])), snr(60), samples, 0)
     assert [len(c.packets) for c in columns] == [0, 1]
-    assert assemble.slots_observed(samples, clock)[0, 0, 28:34].tolist() == [1, 1, 0, 0, 1, 1]
+    assert assemble.slots_observed(samples, clock)[0, 0, 28:34].tolist() == [1, 1, 0, 0, 0, 1]
     assert assemble.slots_observed(samples, clock)[0, 1, :12].tolist() == [2] * 10 + [1] * 2
 
 
@@ -300,3 +300,12 @@ def test_a_column_that_shows_its_neighbour_has_no_packet(
     results = results_of(clock, posteriors_of(w, index), snr, samples_of(clock.n_slots, 4), 0.0)
     assert [c.column for c in results if not c.packets] == expected
     assert all("the column beside it" in (results[column].message or "") for column in expected)
+
+
+def test_a_packet_may_miss_two_slots_of_a_symbol_but_not_three() -> None:
+    n_observed = np.ones((2, 3, 60), np.int64)
+    n_observed[0, 0, :20] = 0  # The header and the dimming symbol are not needed.
+    n_observed[0, 1, [20, 21, 30, 31, 58, 59]] = 0
+    n_observed[1, 2, 57:] = 0
+    np.testing.assert_array_equal(assemble.complete(n_observed, 2), [[True, True, True], [True, True, False]])
+    np.testing.assert_array_equal(assemble.complete(n_observed), [[True, False, True], [True, True, False]])
