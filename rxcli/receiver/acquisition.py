@@ -12,6 +12,7 @@ from rxcli.profiles import ScreenProfile
 from rxcli.receiver import camera as blind
 from rxcli.receiver import plane
 from rxcli.receiver.context import FrameContext
+from rxcli.receiver.light import MIN_VARIANCE
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Clock, IntArray, Outlines, RowProfiles
@@ -81,7 +82,7 @@ def sample_columns(context: FrameContext, n_columns: int) -> RowProfiles:
 
 def noise_of(profiles: RowProfiles) -> float:
     """Standard deviation of a dark row of a strip."""
-    return float(np.sqrt(profiles.noise_floor / max(float(np.median(profiles.count)), 1.0)))
+    return float(np.sqrt(max(profiles.noise_floor / max(float(np.median(profiles.count)), 1.0), MIN_VARIANCE)))
 
 
 def distinct_screens(screens: Sequence[ScreenProfile]) -> list[ScreenProfile]:

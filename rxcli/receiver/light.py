@@ -30,6 +30,8 @@ _MAX_MEMORY = 5
 #: The dark slots in the middle of a header.
 _DARK_FROM = HEADER.index(0, HEADER.index(1))
 _DARK_TO = HEADER.index(1, _DARK_FROM)
+#: Minimum variance of a dark row of a strip: dark parts of a clipped RAW file or of a starved clip show none.
+MIN_VARIANCE = 1e-7
 #: Largest light above black, relative to white, of a sample that counts as dark, and minimum number of those.
 _DARK_LIGHT, _MIN_DARK_SAMPLES = 0.001, 50
 #: Shortest exposure, slots, and narrowest spread of light, column pitches.

@@ -17,7 +17,7 @@ from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import Pose, View
 from rxcli.receiver.context import FrameContext, Timer
-from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
+from rxcli.receiver.light import MIN_VARIANCE, Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
@@ -184,7 +184,7 @@ class TrackedScreen:
 
     def _new_picture(self) -> known_picture.KnownPicture:
         strips, profiles = self._first_pose.map, self._acquisition.profiles
-        noise = NoiseModel(max(profiles.noise_floor, SETTINGS.min_variance * strips.pixels), profiles.noise_slope)
+        noise = NoiseModel(max(profiles.noise_floor, MIN_VARIANCE * strips.pixels), profiles.noise_slope)
         crosstalk = Crosstalk.of(self._n_strips, self._acquisition.screen.light_spread)
         return known_picture.KnownPicture(
             strips.inside.shape, crosstalk, self._black_level, noise.of_mean(strips.pixels)

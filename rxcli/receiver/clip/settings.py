@@ -43,8 +43,6 @@ class ClipSettings:
     good_header: float = 0.6
     header_lead: float = 0.1
     clock_step: float = 0.5
-    #: Variance of a strip's light, at least: that of a starved clip's dark parts is none.
-    min_variance: float = 1e-7
 
     #: First frames whose outlines are compared. First frames that are taken together: for the clock where each shows
     #: little, for the phase of the bursts and for the picture; number where these leave doubt; and share of well lit

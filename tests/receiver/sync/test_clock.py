@@ -12,6 +12,7 @@ from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_o
 
 from rxcli.protocol import encode_packet
 from rxcli.receiver import channel
+from rxcli.receiver.acquisition import noise_of
 from rxcli.receiver.decode import detect
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma, slot_llr
 from rxcli.receiver.sync import clock as sync
@@ -331,3 +332,9 @@ def test_columns_that_start_at_their_own_rows_are_resampled_as_each_by_itself(n:
         )
         shown_well = valid[column, 0] > 0
         np.testing.assert_allclose(light[column, 0][shown_well], fine[shown_well], atol=0.02)
+
+
+def test_a_dark_row_of_a_clipped_picture_has_noise() -> None:
+    rng = np.random.default_rng(1)
+    profiles = row_profiles(random_link(rng, [5] * 4, 5), Shot(), rng)
+    assert noise_of(replace(profiles, noise_floor=0.0)) == pytest.approx(1e-7**0.5)
