@@ -110,7 +110,8 @@ class _Burst:
     #: (C,) weights, and (C, packet) how often each slot was observed.
     w: IntArray
     n_observed: IntArray
-    #: (C,) whether a column repeats its neighbour, and whether its packet may be reported.
+    #: (C,) whether a column's packet is in view, repeats its neighbour's, and may be reported.
+    whole: BoolArray
     echo: BoolArray
     possible: BoolArray
 
@@ -158,7 +159,7 @@ def _burst(
     whole = complete(n_observed, 0 if frames else SETTINGS.max_missing_slots)
     echo = whole & echoes(posteriors, snr_db)[place]
     possible = whole & ~echo & (quality.ber_hat[place] <= SETTINGS.max_ber_hat)
-    return _Burst(packets, posteriors.w, n_observed, echo, possible)
+    return _Burst(packets, posteriors.w, n_observed, whole, echo, possible)
 
 
 def _payloads(index: IntArray, weights: IntArray) -> list[str]:
@@ -203,8 +204,10 @@ def _columns(
         else:
             message = _ECHO if any(burst.echo[column] for burst in bursts) else None
             message = _HEADERLESS if headerless[column] else message or _withheld(confidence, min_confidence)
-            n_observed = np.stack([burst.n_observed[column] for burst in bursts])
-            message = _incomplete_reason(n_observed) or message or _light_reason(status, db)
+            if any(burst.whole[column] for burst in bursts):
+                message = message or _light_reason(status, db)
+            else:
+                message = _incomplete_reason(np.stack([burst.n_observed[column] for burst in bursts]))
         out.append(
             ColumnResult(
                 column=column,
@@ -227,10 +230,8 @@ def _withheld(confidence: float, min_confidence: float) -> str | None:
     return f"its packet has a confidence of {confidence:.4f}, below the {min_confidence:g} asked for (--min-confidence)"
 
 
-def _incomplete_reason(n_observed: IntArray) -> str | None:
-    """Message for a column without a complete packet, or None; `n_observed` is (B, packet)."""
-    if complete(n_observed, SETTINGS.max_missing_slots).any():
-        return None
+def _incomplete_reason(n_observed: IntArray) -> str:
+    """Message for a column without a complete packet; `n_observed` is (B, packet)."""
     missing = int((n_observed[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
     return (
         f"no packet is in view as a whole: of {n_observed.shape[1]} slots {missing} are missing; move closer so that "

@@ -309,3 +309,14 @@ def test_a_packet_may_miss_two_slots_of_a_symbol_but_not_three() -> None:
     n_observed[1, 2, 57:] = 0
     np.testing.assert_array_equal(assemble.complete(n_observed, 2), [[True, True, True], [True, True, False]])
     np.testing.assert_array_equal(assemble.complete(n_observed), [[True, False, True], [True, True, False]])
+
+
+def test_a_packet_of_a_clip_that_misses_a_slot_is_not_whole() -> None:
+    clock, n_observed = clock_of(60, 0, [0, 0]), np.ones((2, 50), np.int64)
+    n_observed[0, 30] = 0
+    posteriors = posteriors_of([5, 5], indices([5, 5]))
+    burst = confidence.BurstInClip(0, 0, posteriors, n_observed, (3,), None, np.zeros(2, np.float32))
+    first, second = assemble.clip_results(clock, [burst], lambda _: False, snr(60), np.zeros(2, bool), 0.0)
+    assert not first.packets
+    assert "of 50 slots 1 are missing" in (first.message or "")
+    assert second.packets
