@@ -91,12 +91,13 @@ def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str 
 
 def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:
     """Receive every screen in a frame; the one with the most packets comes first."""
+    nothing = FrameResult(frame.source, frame.index, frame.time_s, "ok")
     screens = proposed_screens(frame, options, timer)
     if isinstance(screens, Failure):
-        return failed(FrameResult(frame.source, frame.index, frame.time_s, "ok"), screens)
+        return failed(nothing, screens)
     results = [_receive_screen(frame, outlines, options, timer) for outlines in screens]
     if not screens[0][0].stands_out and not results[0].packets:
-        return failed(FrameResult(frame.source, frame.index, frame.time_s, "ok"), no_screen(frame, options, timer))
+        return failed(nothing, no_screen(frame, options, timer))
     results.sort(key=lambda result: -sum(packet.is_believable for packet in result.packets))
     return replace(results[0], other_screens=tuple(result for result in results[1:] if result.packets))
 

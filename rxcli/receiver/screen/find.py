@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import find_combs, grid_of_comb
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
-from rxcli.receiver.screen.numbering import LightProfile, centred_film, first_columns, light_profile
+from rxcli.receiver.screen.numbering import LightProfile, centred, first_columns, light_profile
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.strips import Strips, read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
@@ -101,10 +101,8 @@ def find_screens(
         bright: corners (4, 2) of the bright part of the picture, clockwise from its top left, where borders of columns
             are looked for as well.
     """
-    if min(plane.width, plane.height) < MIN_SIZE_PX:
-        return []
-    strips = read_strips(plane, lens)
-    if strips.lit.shape[1] < _MIN_STRIPS:
+    strips = _strips_of(plane, lens)
+    if strips is None:
         return []
     narrow, wide = ([layout for layout in layouts if layout.is_narrow is many] for many in (True, False))
     screens = _screens_apart(strips, wide) if wide else []
@@ -126,10 +124,16 @@ def find_screens(
 
 def shows_narrow(plane: LightPlane) -> bool:
     """Whether the columns in a picture are narrow."""
+    strips = _strips_of(plane, None)
+    return strips is not None and shows_narrow_columns(strips.without_common_light())
+
+
+def _strips_of(plane: LightPlane, lens: Lens | None) -> Strips | None:
+    """The strips of a picture, or None if it is too small."""
     if min(plane.width, plane.height) < MIN_SIZE_PX:
-        return False
-    strips = read_strips(plane)
-    return strips.lit.shape[1] >= _MIN_STRIPS and shows_narrow_columns(strips.without_common_light())
+        return None
+    strips = read_strips(plane, lens)
+    return strips if strips.lit.shape[1] >= _MIN_STRIPS else None
 
 
 def _screens_apart(strips: Strips, layouts: Sequence[ColumnLayout]) -> list[list[OutlineCandidate]]:
@@ -264,7 +268,7 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout], rank:
         own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, _LAST_STEPS, n_columns=n)
         plane, ends, has_bars = find_rows(strips, light, own, n, layout.aspect)
         if not has_bars:
-            odds = odds + centred_film(profile, columns, n)
+            odds = odds + centred(profile.film, columns, n)
         for number, log_odds in zip(columns.tolist(), odds.tolist(), strict=True):
             if log_odds > odds.max() + _MIN_LOG_ODDS:
                 corners, counted = plane.corners(ends, number - best), own.shifted(number - best)

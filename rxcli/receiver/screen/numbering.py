@@ -163,16 +163,11 @@ def first_columns(light: LightProfile, n_columns: int) -> tuple[IntArray, FloatA
     hidden = np.maximum(np.stack([left - starts, ends - right]), 0.0)
     odds += _OUTSIDE * (~reaches @ hidden) + np.maximum(_OUTSIDE * (reaches @ hidden), _LARGER)
     odds += _ON_BORDER * (_begins(light, starts, 1) + 1.0 * _begins(light, ends, -1))
-    return starts, odds + _centred(light.frame, starts, n_columns), bool(reaches.all())
+    return starts, odds + centred(light.frame, starts, n_columns), bool(reaches.all())
 
 
-def centred_film(light: LightProfile, starts: IntArray, n_columns: int) -> FloatArray:
-    """Log-odds (F,) that a bright picture as high as the screen adds to columns that may be the screen's first."""
-    return _centred(light.film, starts, n_columns)
-
-
-def _centred(span: tuple[float, float] | None, starts: IntArray, n_columns: int) -> FloatArray:
-    """Log-odds (F,) that a span of columns adds where its middle is the screen's."""
+def centred(span: tuple[float, float] | None, starts: IntArray, n_columns: int) -> FloatArray:
+    """Log-odds (F,) that a span of columns adds to those first columns that have its middle at the screen's."""
     if span is None or span[1] - span[0] >= _MAX_SPAN * n_columns:
         return np.zeros(starts.size)
     is_centred = np.abs(sum(span) / 2 - starts - n_columns / 2) < _IN_MIDDLE

@@ -23,7 +23,7 @@ from rxcli.receiver.screen.find import (
     wide_grids,
 )
 from rxcli.receiver.screen.grid import columns_at, grid_between
-from rxcli.receiver.screen.numbering import LightProfile, centred_film, first_columns, light_profile
+from rxcli.receiver.screen.numbering import LightProfile, centred, first_columns, light_profile
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.screen.rows import lit_range
 from rxcli.receiver.screen.strips import read_strips, shows_narrow_columns
@@ -301,7 +301,7 @@ def test_a_film_has_sharp_ends_and_fading_light_has_none() -> None:
     np.testing.assert_allclose(light.film, (2.6, 17.4), atol=0.3)
     assert profile_of("fading").film is None
     columns, log_odds, _ = first_columns(light, 20)
-    assert columns[(log_odds + centred_film(light, columns, 20)).argmax()] == 0
+    assert columns[(log_odds + centred(light.film, columns, 20)).argmax()] == 0
 
 
 @pytest.mark.parametrize("film", [(0.8, 19.2), (0.6, 18.4)])
@@ -310,7 +310,7 @@ def test_narrow_bars_on_both_sides_show_the_first_column(film: tuple[float, floa
     light = np.where((place > 1.5) & (place < 18.5), 2.0, 0.0)
     profile = LightProfile(place, np.ones(place.size, bool), light, 10.0, film, None)
     columns, log_odds, _ = first_columns(profile, 20)
-    log_odds += centred_film(profile, columns, 20)
+    log_odds += centred(film, columns, 20)
     in_doubt = (log_odds > log_odds.max() - 2).sum() > 1
     assert columns[log_odds.argmax()] == 0 or in_doubt
     assert in_doubt == (sum(film) != 20)
