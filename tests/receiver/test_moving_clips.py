@@ -281,6 +281,14 @@ def test_frames_that_show_little_find_their_clock_after_others_without_a_screen(
     assert surely_wrong(results) == 0
 
 
+def test_frames_that_show_little_of_a_camera_that_corrects_its_lens_agree_on_a_clock() -> None:
+    """Their columns have sensor rows of their own, which are joined as the picture rows are."""
+    scene = at_rate(120, "paper-17k3", 8).scene
+    results, score = received(filmed(replace(scene, hand_px=0.0, isp=replace(scene.isp, correct_distortion=True))))
+    assert score.extra_error_free >= 8
+    assert surely_wrong(results) == 0
+
+
 def test_a_common_clock_that_does_not_fit_a_frame_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     clip = filmed_by(at_rate(120, "paper-17k3", 8))
     plain = received(clip)[1]

@@ -117,22 +117,31 @@ def _one_after_the_other(profiles: Sequence[RowProfiles], starts: FloatArray, pa
         starts: (n,) row of each frame's start, counted from that of the first frame.
         packet_rows: length of a packet; a pause between two frames is known, and matters, up to whole packets.
     """
-    light, inside, end = [profiles[0].light], [profiles[0].inside], profiles[0].rows.size
+    picture = profiles[0]
+    # Sensor rows of a frame that reach beyond its picture rows must not reach into the next frame.
+    light, inside, shifts, end = [picture.light], [picture.inside], [0], picture.rows.size
+    overhang = 0.0 if picture.sensor_row is None else float(np.ptp(picture.sensor_row - picture.rows))
     for following, start in zip(profiles[1:], starts[1:], strict=True):
-        pause = int(np.round((start - end) % packet_rows))
+        pause = int(np.round((start - end - overhang) % packet_rows + overhang))
         light += [np.repeat(following.light[..., :1], pause, axis=2), following.light]
         inside += [np.zeros((*following.inside.shape[:2], pause), bool), following.inside]
+        shifts.append(end + pause)
         end += pause + following.rows.size
-    rows = profiles[0].rows[0] + np.arange(end)
-    return replace(profiles[0], light=np.concatenate(light, axis=2), inside=np.concatenate(inside, axis=2), rows=rows)
+    rows, sensor_row = picture.rows[0] + np.arange(end), picture.sensor_row
+    if sensor_row is not None:
+        shown = np.concatenate([picture.rows + shift for shift in shifts])
+        joined = np.concatenate([sensor_row + shift for shift in shifts], axis=2)
+        sensor_row = np.apply_along_axis(lambda strip: np.interp(rows, shown, strip), 2, joined)
+    light_of_all, inside_of_all = np.concatenate(light, axis=2), np.concatenate(inside, axis=2)
+    return replace(picture, light=light_of_all, inside=inside_of_all, rows=rows, sensor_row=sensor_row)
 
 
 def acquisition_at(start: Start, context: FrameContext) -> Acquisition | None:
     """What the clip's clock predicts for a frame; None where nothing of the screen is in the picture."""
     screen, frame, camera = start.screen, context.frame, context.camera
     profiles = sample_columns(context, screen.columns)
-    rows = np.flatnonzero(profiles.inside.any(axis=(0, 1)))
-    if rows.size == 0:
+    top, bottom = sync.row_span(profiles)
+    if top == bottom:
         return None
     rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
     like = Clock(
@@ -146,7 +155,6 @@ def acquisition_at(start: Start, context: FrameContext) -> Acquisition | None:
         delay_slots=np.zeros(screen.columns),
         header_peak_ratio=start.lead,
     )
-    n_slots = int(np.ceil((rows[-1] - rows[0] + 1) / rows_per_slot)) + 1
-    top = float(profiles.rows[rows[0]]) - 0.5
+    n_slots = int(np.ceil((bottom - top) / rows_per_slot)) + 1
     clock = start.time.clock_at(frame.index, frame.time_s, like, n_slots, top)
     return None if clock is None else Acquisition(screen, profiles, clock, variants=start.variants)

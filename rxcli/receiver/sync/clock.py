@@ -179,7 +179,7 @@ def find_clock(
     """
     import cv2
 
-    top, bottom = _row_span(profiles)
+    top, bottom = row_span(profiles)
     step = rows_per_slot / SETTINGS.search_samples
     n = int((bottom - top) / step)
     if n < SLOTS_PER_SYMBOL * SETTINGS.search_samples:
@@ -223,7 +223,7 @@ def find_clock(
     )
 
 
-def _row_span(profiles: RowProfiles) -> tuple[float, float]:
+def row_span(profiles: RowProfiles) -> tuple[float, float]:
     """Borders of the top and the bottom sensor row in view of any strip."""
     rows = profiles.rows if profiles.sensor_row is None else profiles.sensor_row
     shown = np.broadcast_to(rows, profiles.inside.shape)[profiles.inside]
