@@ -22,6 +22,7 @@ from rxcli.calibrate.fitting import Z95, weighted_mean
 from rxcli.calibrate.periodic import FEW_PERIODS, PeriodicFit, fit_fundamental
 from rxcli.calibrate.spots import find_spots
 from rxcli.errors import ReceiverError, UsageError
+from rxcli.profiles import LensModel
 from rxcli.types import BoolArray, FloatArray
 
 Axis = Literal["rows", "columns"]
@@ -87,6 +88,8 @@ class ShutterCalibration:
     lamps: tuple[Stripes, ...] = ()
     #: What a user should know before trusting the figures.
     warnings: tuple[str, ...] = ()
+    #: Lens whose distortion the camera corrected, estimated together with the line delay; None where stripes are straight.
+    lens: LensModel | None = None
 
     @property
     def n_lines(self) -> int:

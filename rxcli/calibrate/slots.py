@@ -13,11 +13,12 @@ from rxcli.calibrate.shutter import Axis, ShutterCalibration
 from rxcli.errors import ReceiverError
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
+from rxcli.receiver.camera import camera_profile
 from rxcli.receiver.pipeline import receive_frame
 from rxcli.types import Frame
 
-#: Confidence of a packet that confirms a picture's slot clock.
-_MIN_CONFIDENCE = 0.5
+_CORRECTED = "the camera corrected its lens distortion: line delay and distortion were estimated together"
+_REVERSED = "the picture was turned upside down: a profile is of use for pictures as the camera stores them only"
 
 
 def calibrate_slots(frames: Sequence[Frame], screen: ScreenProfile, axis: Axis = "rows") -> ShutterCalibration:
@@ -34,14 +35,17 @@ def calibrate_slots(frames: Sequence[Frame], screen: ScreenProfile, axis: Axis =
     options = ReceiverOptions(screens=(screen,), cameras=())
     upright = [f if axis == "rows" else replace(f, pixels=np.rot90(f.pixels)) for f in frames]
     results = [receive_frame(frame, options) for frame in upright]
-    confirmed = [r.estimated for r in results if any(p.confidence >= _MIN_CONFIDENCE for p in r.packets)]
+    confirmed = [r.estimated for r in results if any(p.is_believable for p in r.packets)]
     if not confirmed:
         reason = next((f" ({r.message.split(';')[0]})" for r in results if r.message), "")
         hint = "let the whole screen show and use a short exposure; at least two rows a slot are needed"
         raise ReceiverError(f"no slot clock of a sending screen in the pictures{reason}", hint)
     value, sd = weighted_mean(*zip(*(estimated["line_delay_s"] for estimated in confirmed), strict=True))
-    bent = any("k1" in estimated for estimated in confirmed)
-    warning = "the camera corrected its lens distortion: line delay and distortion were estimated together"
+    bent = [estimated for estimated in confirmed if "k1" in estimated]
+    surest = min(bent, key=lambda estimated: estimated["k1"][1], default=confirmed[0])
+    lens = camera_profile(surest, "estimated", None, None, upright[0].width, upright[0].height).lens
+    warnings = [_CORRECTED] if bent else []
+    warnings += [_REVERSED] if any(estimated["readout_reversed"][0] for estimated in confirmed) else []
     exposure = ExposureEstimate(None, None, "not estimated from data; use a lamp and --frequency")
     shape, periods = (frames[0].height, frames[0].width), upright[0].height * value * screen.slot_rate_hz
-    return ShutterCalibration(axis, shape, value, sd, periods, exposure, warnings=(warning,) * bent)
+    return ShutterCalibration(axis, shape, value, sd, periods, exposure, warnings=tuple(warnings), lens=lens)

@@ -259,7 +259,7 @@ def shutter(
     for warning in result.warnings:
         click.echo(f"vlc-rx: {warning}", err=True)
     record, lines = _shutter_report(result)
-    wanted.write(record, lines, chosen[0].metadata, lambda profile: with_mode(profile, _mode(result, mode)))
+    wanted.write(record, lines, chosen[0].metadata, lambda profile: _with_shutter(profile, result, mode))
 
 
 def _frames(paths: list[Path], n: int) -> list[Frame]:
@@ -283,6 +283,12 @@ def _mode(result: ShutterCalibration, name: str | None = None) -> ReadoutMode:
     return ReadoutMode(name=name or f"{width}x{height}", width=width, height=height, line_delay_s=result.line_delay_s)
 
 
+def _with_shutter(profile: CameraProfile, result: ShutterCalibration, mode: str | None) -> CameraProfile:
+    """The profile with the readout mode that was measured, and the lens that was estimated with it."""
+    profile = with_mode(profile, _mode(result, mode))
+    return profile if result.lens is None else with_lens(profile, result.lens)
+
+
 def _shutter_report(result: ShutterCalibration) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """The record of the JSON, and the lines for people."""
     keys = ("readout_s", "readout_interval_s", "line_delay_s", "line_delay_interval_s", "periods", "axis", "warnings")
@@ -292,6 +298,7 @@ def _shutter_report(result: ShutterCalibration) -> tuple[dict[str, Any], list[tu
     record: dict[str, Any] = {key: getattr(result, key) for key in keys}
     record |= {"height": result.shape[0], "width": result.shape[1], "exposure_s": exposure.exposure_s}
     record |= {"exposure_interval_s": exposure.interval_s, "exposure_note": exposure.comment}
+    record["lens"] = None if result.lens is None else _lens_record(result.lens)
     record["lamps"] = [
         {key: getattr(lamp, key) for key in of_lamp} | {key: getattr(lamp.fit, key) for key in of_fit}
         for lamp in result.lamps
@@ -304,6 +311,7 @@ def _shutter_report(result: ShutterCalibration) -> tuple[dict[str, Any], list[tu
         ("line delay", f"{delay} us (95 %: {' to '.join(around)})"),
         ("periods", f"{result.periods:.2f}"),
         ("exposure", f"{exposed} ({exposure.comment})"),
+        *([] if result.lens is None else [_distortion(result.lens)]),
     ]
     for lamp in result.lamps:
         frequency = "unknown frequency" if lamp.frequency_hz is None else f"{lamp.frequency_hz:g} Hz"

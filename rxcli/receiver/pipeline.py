@@ -16,6 +16,7 @@ from rxcli.numerics import one_blas_thread
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.acquisition import Acquisition
+from rxcli.receiver.cameras import difference, with_estimates
 from rxcli.receiver.context import Failure, Outline, Timer
 from rxcli.receiver.corners import no_screen, proposed_screens, too_small
 from rxcli.receiver.decode import assemble
@@ -75,7 +76,7 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     """Receive one frame as a photograph."""
     timer = Timer()
     with one_blas_thread():
-        result = _receive_still(frame, _in_total_order(options), timer)
+        result = _receive_stated(frame, _in_total_order(options), timer)
     result = replace(result, message=_with_tried(result, options.screens), timing_ms=timer.total())
     if options.mirrored:
         return result.with_columns_mirrored()
@@ -89,6 +90,31 @@ def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str 
     return f"{result.message}; only the screen {screens[0].name} was tried (--screen auto tries all)"
 
 
+def _receive_stated(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:
+    """Receive a frame as profile and file state its camera; where few columns give packets, also as it is estimated."""
+    best = stated = _receive_still(frame, options, timer)
+    for attempt, estimating in with_estimates(frame, options):
+        if not _gives_few(best):
+            break
+        result = _receive_still(attempt, replace(estimating, dump_dir=None), timer)
+        if _n_believable(result) > _n_believable(best):
+            best = result if options.dump_dir is None else _receive_still(attempt, estimating, timer)
+            is_exposure = attempt.metadata.exposure_s != frame.metadata.exposure_s
+            message = difference(frame, options, stated, best, is_exposure=is_exposure)
+            best = replace(best, message=message if best.message is None else f"{message}; {best.message}")
+    return best
+
+
+def _gives_few(result: FrameResult) -> bool:
+    """Whether less than half of the lit columns gave a packet."""
+    lit = [column for column in result.columns if column.status != "dark"]
+    return 2 * sum(column.status == "ok" for column in lit) < max(len(lit), 1)
+
+
+def _n_believable(result: FrameResult) -> int:
+    return sum(packet.is_believable for packet in result.packets)
+
+
 def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:
     """Receive every screen in a frame; the one with the most packets comes first."""
     nothing = FrameResult(frame.source, frame.index, frame.time_s, "ok")
@@ -98,7 +124,7 @@ def _receive_still(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fram
     results = [_receive_screen(frame, outlines, options, timer) for outlines in screens]
     if not screens[0][0].stands_out and not results[0].packets:
         return failed(nothing, no_screen(frame, options, timer))
-    results.sort(key=lambda result: -sum(packet.is_believable for packet in result.packets))
+    results.sort(key=lambda result: -_n_believable(result))
     return replace(results[0], other_screens=tuple(result for result in results[1:] if result.packets))
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import rxcli
 from rxcli.calibrate.slots import calibrate_slots
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode, ReceiverError
@@ -70,6 +71,17 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert record["readout_s"] == pytest.approx(960 / SCREEN.slot_rate_hz / 3.4, rel=1e-3)
     assert run([*arguments, "no-such"]) == ExitCode.USAGE
     assert run([*arguments, "paper-17k3", "--region", "0,0,99,99"]) == ExitCode.USAGE
+
+
+def test_the_profile_of_a_camera_that_corrects_its_lens_receives_the_next_picture(tmp_path: Path) -> None:
+    pictures = [tmp_path / "first.png", tmp_path / "next.png"]
+    for seed, path in enumerate(pictures, 1):
+        Image.fromarray(phone_picture(3.4, 0.08, seed)).save(path)
+    profile = str(tmp_path / "phone.toml")
+    assert run(["calibrate", "shutter", str(pictures[0]), "--screen", "paper-17k3", "--save", profile]) == 0
+    result = rxcli.decode(pictures[1], screens="paper-17k3", cameras=profile)
+    assert result.camera_profile == "phone"
+    assert sum(packet.is_believable for packet in result.packets) >= 12
 
 
 @pytest.mark.parametrize("name", ["video4k_rocket_34k6.mp4", "xs10_china_17k3.jpg", "phone_astronaut_17k3.jpg"])

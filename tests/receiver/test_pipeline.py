@@ -147,6 +147,30 @@ def test_raw_mosaic() -> None:
     assert (score.false, score.wrong_w) == (0, 0)
 
 
+@pytest.mark.parametrize("factor", [3, 10])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_wrongly_stated_exposure_is_estimated_and_the_difference_is_said(factor: float, known: bool) -> None:
+    taken = clean()
+    frame, options = frame_of(taken), options_for(taken)
+    stated_s = factor * taken.truth["camera"]["exposure_s"]
+    frame = replace(frame, metadata=Metadata(exposure_s=stated_s))
+    result = received(frame, options if known else replace(options, cameras=(), force_camera=False))
+    assert score_of(result, taken).error_free == 20
+    assert f"the stated exposure ({1e6 * stated_s:.0f} us)" in str(result.message)
+
+
+@pytest.mark.parametrize("change", [{"line_delay_s": 7e-6}, {"width": 99}])
+def test_a_profile_that_gives_no_packet_is_no_veto(change: dict[str, Any]) -> None:
+    taken = clean()
+    options = options_for(taken)
+    (mode,) = options.cameras[0].modes
+    wrong = msgspec.structs.replace(options.cameras[0], modes=(msgspec.structs.replace(mode, **change),))
+    result = received(frame_of(taken), replace(options, cameras=(wrong,)))
+    assert score_of(result, taken).error_free == 20
+    assert result.camera_profile is None
+    assert "camera profile truth" in str(result.message)
+
+
 def test_the_right_screen_among_all_is_told() -> None:
     taken = clean()
     result = received(frame_of(taken), options_for(taken, screens=tuple(shipped_profiles(ScreenProfile))))
