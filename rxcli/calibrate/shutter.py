@@ -88,7 +88,7 @@ class ShutterCalibration:
     lamps: tuple[Stripes, ...] = ()
     #: What a user should know before trusting the figures.
     warnings: tuple[str, ...] = ()
-    #: Lens whose distortion the camera corrected, estimated together with the line delay; None where stripes are straight.
+    #: Lens whose distortion the camera corrected, estimated with the line delay; None where stripes are straight.
     lens: LensModel | None = None
 
     @property
