@@ -56,6 +56,7 @@ class _Scenarios(SuggestingGroup):
 _RECEPTION = (
     ("--way ways", [str], None, "A way to receive in place of the scenario's; may be given several times."),
     ("--cae", ("auto", "always", "never"), None, "When the auto-encoder runs."),
+    ("--save", click.Path(file_okay=False, path_type=Path), None, "Also write the drawn captures into this folder."),
     ("--also journals", [_FILE], None, "Count an earlier run's packets in the bins, too; may be given several times."),
 )
 
@@ -85,7 +86,9 @@ def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given
     name, out = str(context.info_name), given["out"]
     scenario = _chosen(name, given["captures"], given["only"], given["ways"])
     run = _begin(name, out, given["fresh"], given["jobs"], given["quiet"])
-    tasks = scenario.tasks(given["seed"], given["count"] or scenario.count, out / "media", given["cae"])
+    more = {"save": str(given["save"])} if given["save"] else {}
+    count = given["count"] or scenario.count
+    tasks = scenario.tasks(given["seed"], count, out / "media", cae=given["cae"], **more)
     records = run(tasks, name, alone=scenario.alone)
     rows = measures.rows(records, scenario.ways, scenario.all_columns, scenario.beside)
     odd = measures.worth_a_look(records, scenario.ways)
@@ -100,8 +103,10 @@ def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given
         for weights in details["weights"].values():
             click.echo("likeliest weights of the features: " + " ".join(f"{weight:+.3f}" for weight in weights))
         tables.plot(bins, out / f"{name}-bins.png", "error_free", "interval95", "confidence")
-    if "ber" in rows[0]:
-        tables.plot(rows[: -len(scenario.ways)], out / f"{name}.png", "ber", "ber95")
+    points = [row for row in rows if row["scenes"] in scenario.points]
+    for measure in ("ber", "share"):
+        if points and f"{measure}95" in points[0]:
+            tables.plot(points, out / f"{name}.png", measure, f"{measure}95")
     _say_written(tables.write_outputs(out, name, rows, details))
     return ExitCode.OK if measures.passes(records, scenario.ways) else ExitCode.NOT_RECEIVED
 

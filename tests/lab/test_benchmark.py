@@ -16,7 +16,8 @@ import pytest
 from click.testing import CliRunner
 
 from rxcli.cli.benchmark import benchmark
-from rxcli.errors import InputError, ReceiverError, UsageError
+from rxcli.cli.main import run
+from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError
 from rxcli.ingest import open_source
 from rxcli.lab.benchmark import cases, compare, measures, quick, runner, tables
 from rxcli.lab.benchmark.cases import Case, received
@@ -292,6 +293,20 @@ def test_a_scenario_writes_table_and_journal(tmp_path: Path) -> None:
     assert (tmp_path / "phones.journal.jsonl").read_text().count("\n") == 1
 
 
+@pytest.mark.parametrize("clip", [{}, {"cameras": ["video-1080p"], "n_frames": 2}])
+def test_drawn_captures_are_saved_with_all_that_is_known(clip: dict[str, Any], tmp_path: Path) -> None:
+    point = {"screens": ["paper-8k65"], "exposure_slots": [3.0, 3.0], "width_px": 160, **clip}
+    task = {"draw": "people", "ways": ["bound"], "seed": 2, "number": 0, "folder": str(tmp_path), "cae": None}
+    (record,) = do({**task, "label": "3 slots", "point": point, "save": str(tmp_path)})
+    (known,) = (json.loads(path.read_text()) for path in tmp_path.glob("3-slots-2-0-0.case.json"))
+    assert record["about"]["exposure_slots"] == pytest.approx(3)
+    assert (record["ways"]["bound"]["score"]["error_free"] > 0) == (not clip)
+    truth = json.loads((tmp_path / "3-slots-2-0-0.truth.json").read_text())
+    assert truth["corners_sensor_px"]
+    assert truth["camera"]["exposure_s"] == pytest.approx(3 / 8650, rel=1e-3)
+    assert run(known["named"]) in (ExitCode.OK, ExitCode.NOT_RECEIVED)
+
+
 def test_packets_of_earlier_journals_are_in_the_bins(tmp_path: Path) -> None:
     earlier = tmp_path / "earlier.jsonl"
     earlier.write_text(json.dumps({"key": "x", "records": [_record(packets=((0.95, 0), (0.95, 1)))]}) + "\n")
@@ -348,7 +363,7 @@ def test_a_checkout_that_breaks_off_is_told(tmp_path: Path) -> None:
 
 def test_frames_without_data_are_compared_as_a_clip(tmp_path: Path) -> None:
     case = next(iter(draw_nodata(Place(3, 0, {"n_frames": 3}, tmp_path))))
-    path = Path(compare.arguments_of(case, tmp_path / "case")[1])
+    path = cases.write_case(case, tmp_path / "case")
     assert len(list(open_source(path))) == len(case.source) == 3
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from rxcli.lab.benchmark.runner import scenarios
 from rxcli.lab.simulate.no_data import EVEN_KINDS, NO_DATA_KINDS, STRIPED_KINDS
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.pictures import DARK_KINDS, draw_dark_picture
+from rxcli.lab.simulate.population import Population
 from rxcli.lab.simulate.scenes import preset
 from rxcli.types import Frame
 
@@ -44,6 +46,23 @@ def test_phones_are_as_asked_for() -> None:
         assert rows / scene.rows_per_slot / screen.packet_slots >= 1.3
     assert phone_of(3, 7) == drawn[7]
     assert drawn[7] != drawn[8]
+
+
+def test_people_take_what_the_population_says() -> None:
+    aim = {"exposure_slots": [0.4, 10.0], "packets": [1.25, 9.0], "dark": 0.5}
+    population = msgspec.convert(aim, Population)
+    drawn = [population.draw(np.random.default_rng(number)) for number in range(24)]
+    slots = [scene.exposure_s * scene.screen.slot_rate_hz for scene, _ in drawn]
+    assert 0.4 <= min(slots) < 1 < 4 < max(slots) <= 10
+    assert 5 < sum(kind in DARK_KINDS for _, kind in drawn) < 19
+    for scene, _ in drawn:
+        sensor = scene.sensor
+        assert 10e-3 <= sensor.line_delay_s * sensor.height <= 31e-3
+        # The gain follows the exposure: white is as bright as ever.
+        assert 1.6 <= sensor.full_scale_e / (scene.light_e_per_s * scene.exposure_s * scene.isp.gain) <= 2.4
+    assert {scene.orientation for scene, _ in drawn} == {1, 3}
+    again, _ = population.draw(np.random.default_rng(5))
+    assert replace(again, picture="") == replace(drawn[5][0], picture="")
 
 
 def test_seeds_of_published_figures_draw_the_scenes_of_old() -> None:

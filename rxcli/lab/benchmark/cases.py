@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -22,10 +23,12 @@ from rxcli.ingest import open_source
 from rxcli.lab.benchmark.media import bare_decode
 from rxcli.lab.benchmark.trial import Trial
 from rxcli.lab.benchmark.yardsticks import bound_result, paper_result
+from rxcli.lab.simulate.files import write_dng, write_video
 from rxcli.options import SKIPS, ReceiverOptions
-from rxcli.profiles import CameraProfile
+from rxcli.outputs import write_whole
+from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile
 from rxcli.receiver.pipeline import receive
-from rxcli.results.truth import Scorer, Truth
+from rxcli.results.truth import Scorer, Truth, truth_path
 from rxcli.runs.processes import ONE_THREAD, environment, peak_memory_mb, start_process
 from rxcli.types import FloatArray, Frame, FrameResult
 
@@ -54,16 +57,67 @@ class Case:
     about: Record
     #: What was sent, where that is known.
     truth: Truth | None = None
+    #: The same with all that the simulator knows, as it stands beside a capture.
+    whole_truth: Record | None = None
     #: False for pictures from which nothing may be reported.
     has_data: bool = True
     #: (4, 2) true corners of the screen on the stored picture.
     corners: FloatArray | None = None
+    #: With screen, camera and corners named, as far as a perfect calibration knows them.
+    named: ReceiverOptions | None = None
     #: The simulated frame, for the bound and the paper's pipeline.
     trial: Trial | None = None
 
     def frames(self) -> Iterable[Frame]:
         """The frames in order of time."""
         return open_source(self.source) if isinstance(self.source, Path) else self.source
+
+
+def write_case(case: Case, stem: Path) -> Path:
+    """Write a case as a file of this stem, its truth beside it; returns where."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    path = _written(case, stem)
+    truth = case.whole_truth or case.truth
+    if truth is not None:
+        write_whole(truth_path(path), msgspec.json.encode(truth))
+    return path
+
+
+def arguments_of(path: Path, options: ReceiverOptions) -> list[str]:
+    """The arguments of `vlc-rx` that receive a written case with some options; profiles go beside the file."""
+    arguments = ["decode", str(path), "--json", "-", "--quiet", "--truth", "auto", "--cae", options.cae]
+    named: list[ScreenProfile | CameraProfile] = list(options.cameras if options.force_camera else ())
+    named += () if options.screens == ReceiverOptions().screens else options.screens
+    for number, profile in enumerate(named):
+        toml = path.with_suffix(f".{number}.toml")
+        write_whole(toml, dump_profile(profile))
+        arguments += [f"--{profile.kind}", str(toml)]
+    if options.corners is not None:
+        arguments += ["--corners", *(f"{x:.3f},{y:.3f}" for x, y in options.corners)]
+    return arguments + [part for name in SKIPS if name not in options.skip for part in ("--no-skip", name)]
+
+
+def _written(case: Case, stem: Path) -> Path:
+    """The case's file: a copy, a clip of several frames, a JPEG or DNG where one was simulated, or else a PNG."""
+    if isinstance(case.source, Path):
+        return Path(shutil.copyfile(case.source, stem.with_suffix(case.source.suffix)))
+    frame, trial = case.source[0], case.trial
+    if len(case.source) > 1:
+        path = stem.with_suffix(".mp4")
+        pictures = (cv2.cvtColor(np.asarray(each.pixels), cv2.COLOR_GRAY2RGB) for each in case.source)
+        write_video(pictures, path, "h264", 1 / (case.source[1].time_s - frame.time_s))
+        return path
+    if trial is None or frame is not trial.frame:
+        # A picture that was changed after its simulation is stored anew, without metadata.
+        path = stem.with_suffix(".png")
+        write_whole(path, cv2.imencode(".png", np.asarray(frame.pixels))[1].tobytes())
+    elif trial.capture.scene.is_mosaic:
+        path = stem.with_suffix(".dng")
+        write_dng(trial.capture.raw, trial.capture.scene, path)
+    else:
+        path = stem.with_suffix(".jpg")
+        write_whole(path, trial.capture.jpeg)
+    return path
 
 
 def _with_options(**changes: Any) -> Way:
@@ -80,6 +134,7 @@ RECEIVER, OTHER_KERNEL = "receiver", "another kernel"
 WAYS: dict[str, Way] = {
     RECEIVER: _with_options(),
     "corners given": lambda case: receive(case.frames(), replace(case.options, corners=case.corners)),
+    "camera and corners given": lambda case: receive(case.frames(), case.named or case.options),
     "frames one by one": _with_options(skip=frozenset(SKIPS) - {"tracking"}),
     "searched": _with_options(corners=None),
     "no auto-encoder": _with_options(cae="never"),
@@ -89,8 +144,8 @@ WAYS: dict[str, Way] = {
     "two threads": _on_two_threads,
     "grey levels": lambda case: receive(map(with_grey_levels, case.frames()), case.options),
     "cropped by a row": lambda case: receive(map(without_first_row, case.frames()), cropped_options(case.options)),
-    "bound": lambda case: [bound_result(case.trial)],
-    "paper": lambda case: [paper_result(case.trial)],
+    "bound": lambda case: [] if case.trial is None else [bound_result(case.trial)],
+    "paper": lambda case: [] if case.trial is None else [paper_result(case.trial)],
 }
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -17,20 +16,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cv2
-import msgspec
-import numpy as np
-
 from rxcli.errors import ReceiverError, UsageError
-from rxcli.lab.benchmark.cases import Case, Record
+from rxcli.lab.benchmark.cases import Record, arguments_of, write_case
 from rxcli.lab.benchmark.draw import DRAWERS, Place
 from rxcli.lab.benchmark.measures import Row
 from rxcli.lab.benchmark.runner import CHECKOUT, Task
-from rxcli.lab.simulate.files import write_dng, write_video
-from rxcli.options import SKIPS, ReceiverOptions
-from rxcli.outputs import write_whole
-from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile
-from rxcli.results.truth import truth_path
 
 #: What the other process runs: argument lists come on stdin as JSON, records and CPU seconds go to stdout.
 _WORKER = """
@@ -52,47 +42,6 @@ _ENVIRONMENT["VLC_RX_NO_CAMERA_CACHE"] = "1"
 #: The ways of a comparison; packets of this checkout are compared with those of the other.
 WAYS = ("other checkout", "this checkout")
 COLUMNS = ("n", "same", "packets", "right_packets", "sure", "surely_wrong", "changed", "cpu_s", "cpu_ratio")
-
-
-def arguments_of(case: Case, stem: Path) -> list[str]:
-    """Write a case as files of this stem: picture, truth, profiles; the arguments of `vlc-rx` that receive it."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    path, options = _written(case, stem), case.options
-    arguments = ["decode", str(path), "--json", "-", "--quiet", "--truth", "auto", "--cae", options.cae]
-    if case.truth is not None:
-        write_whole(truth_path(path), msgspec.json.encode(case.truth))
-    named: list[ScreenProfile | CameraProfile] = list(options.cameras if options.force_camera else ())
-    named += () if options.screens == ReceiverOptions().screens else options.screens
-    for number, profile in enumerate(named):
-        toml = stem.with_suffix(f".{number}.toml")
-        write_whole(toml, dump_profile(profile))
-        arguments += [f"--{profile.kind}", str(toml)]
-    if options.corners is not None:
-        arguments += ["--corners", *(f"{x:.3f},{y:.3f}" for x, y in options.corners)]
-    return arguments + [part for name in SKIPS if name not in options.skip for part in ("--no-skip", name)]
-
-
-def _written(case: Case, stem: Path) -> Path:
-    """The case's file: a copy, a clip of several frames, a JPEG or DNG where one was simulated, or else a PNG."""
-    if isinstance(case.source, Path):
-        return Path(shutil.copyfile(case.source, stem.with_suffix(case.source.suffix)))
-    frame, trial = case.source[0], case.trial
-    if len(case.source) > 1:
-        path = stem.with_suffix(".mp4")
-        pictures = (cv2.cvtColor(np.asarray(each.pixels), cv2.COLOR_GRAY2RGB) for each in case.source)
-        write_video(pictures, path, "h264", 1 / (case.source[1].time_s - frame.time_s))
-        return path
-    if trial is None or frame is not trial.frame:
-        # A picture that was changed after its simulation is stored anew, without metadata.
-        path = stem.with_suffix(".png")
-        write_whole(path, cv2.imencode(".png", np.asarray(frame.pixels))[1].tobytes())
-    elif trial.capture.scene.is_mosaic:
-        path = stem.with_suffix(".dng")
-        write_dng(trial.capture.raw, trial.capture.scene, path)
-    else:
-        path = stem.with_suffix(".jpg")
-        write_whole(path, trial.capture.jpeg)
-    return path
 
 
 def check_checkout(path: Path) -> Path:
@@ -123,7 +72,8 @@ def compare(tasks: Sequence[Task], rival: Path, folder: Path, repeats: int, tick
     jobs: list[list[str]] = []
     for task in tasks:
         for case in DRAWERS[task["draw"]](Place(task["seed"], task["number"], task["point"], folder)):
-            jobs.append(arguments_of(case, (folder / f"{task['draw']}-{task['seed']}-{len(jobs)}").resolve()))
+            stem = (folder / f"{task['draw']}-{task['seed']}-{len(jobs)}").resolve()
+            jobs.append(arguments_of(write_case(case, stem), case.options))
             groups = [*filter(None, [task["label"]]), *case.groups]
             records.append({"about": {"file": jobs[-1][1]}, "has_data": case.has_data, "groups": groups, "ways": {}})
     turns: dict[str, list[list[Record]]] = {way: [] for way in WAYS}

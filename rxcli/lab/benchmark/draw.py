@@ -18,13 +18,14 @@ import numpy as np
 
 from rxcli.lab.benchmark.cases import Case
 from rxcli.lab.benchmark.media import Medium, camera_path
-from rxcli.lab.benchmark.trial import SOURCE, Trial, simulate_trial
+from rxcli.lab.benchmark.trial import SOURCE, Trial, corners_on_picture, simulate_trial
 from rxcli.lab.simulate.capture import Recording, prepare
 from rxcli.lab.simulate.files import write_video
 from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.no_data import STRIPED_KINDS, draw_kind, no_data_scene
-from rxcli.lab.simulate.optics import Lens, Pose, View
+from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.pictures import DARK_KINDS, PHOTOS, draw_dark_picture, draw_name
+from rxcli.lab.simulate.population import Population, placed
 from rxcli.lab.simulate.scenes import Scene, draw_weight, preset, random_scene
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.lab.simulate.truth import build_camera_profile
@@ -65,8 +66,30 @@ def _case(trial: Trial, options: ReceiverOptions, *groups: str, **about: Any) ->
     scene, frames = trial.capture.scene, (trial.frame,)
     about |= {"screen": scene.screen.name, "camera": scene.camera_name, "rows_per_slot": scene.rows_per_slot}
     about["picture"] = scene.picture if isinstance(scene.picture, str) else "drawn"
-    known: dict[str, Any] = {"truth": trial.truth, "corners": trial.corners, "trial": trial}
-    return Case(source=frames, options=options, groups=groups, about=about, **known)
+    known: dict[str, Any] = {"truth": trial.truth, "whole_truth": trial.capture.truth, "corners": trial.corners}
+    return Case(source=frames, options=options, groups=groups, about=about, trial=trial, **known)
+
+
+# Pictures and clips as people take them.
+
+
+def draw_people(at: Place) -> Iterator[Case]:
+    """A capture of a population, its camera unknown; point: fields of `Population`."""
+    population = msgspec.convert(at.point, Population)
+    scene, kind = population.draw(np.random.default_rng([at.seed, at.number, 31]))
+    group = "dark" if kind in DARK_KINDS else "bright"
+    about = {"kind": kind, "exposure_slots": scene.exposure_s * scene.screen.slot_rate_hz}
+    if scene.n_frames == 1:
+        trial = simulate_trial(scene, at.flat, oracle=at.oracle)
+        case = _case(trial, ReceiverOptions(), group, **about)
+        yield replace(case, named=trial.options())
+        return
+    recording = prepare(scene, at.flat)
+    rng = np.random.default_rng([at.seed, at.number, 37])
+    with filmed(recording, [("h264", "veryfast", _bit_rate(rng, scene, _BITS_PER_PIXEL))]) as (path,):
+        case = _clip(recording, path, True, group)
+        known = replace(case.options, corners=case.corners)
+        yield replace(case, options=ReceiverOptions(), named=known, about=case.about | about)
 
 
 # Phones that nobody has measured.
@@ -199,22 +222,6 @@ def screen_of(seed: int, number: int) -> tuple[Scene, str]:
     angles = (rng.normal(0, 1.5), rng.normal(0, 4), rng.normal(0, 4))
     scene = replace(scene, slot_rate_error_ppm=slot_rate_error_ppm)
     return placed(scene, share, angles, rng.uniform(-0.9, 0.9, 2)), kind
-
-
-def placed(scene: Scene, share: float, angles: tuple[float, float, float], place: FloatArray) -> Scene:
-    """The scene with a screen of a share of the picture, at `place` (-1..1) of the room that is left."""
-    sensor = scene.sensor
-    size = np.array([sensor.width, sensor.height])
-    roll, yaw, pitch = angles
-    pose = replace(scene.pose, fill=0.9, roll_deg=roll, yaw_deg=yaw, pitch_deg=pitch, shift_x=0.0, shift_y=0.0)
-    for _ in range(12):
-        view = View(scene.screen, scene.lens, pose, sensor.width, sensor.height, sensor.pixel_aspect)
-        low, high = view.corners.min(axis=0), view.corners.max(axis=0)
-        goal = size / 2 + place * np.maximum(size - (high - low), 0) / 2
-        x, y = 0.9 * (goal - (low + high) / 2) / size
-        fill = pose.fill * min(share * size[1] / (high - low)[1], 0.985 * size[0] / (high - low)[0])
-        pose = replace(pose, fill=float(fill), shift_x=pose.shift_x + float(x), shift_y=pose.shift_y + float(y))
-    return replace(scene, pose=pose)
 
 
 # Small scenes from clean to hopeless, for thousands of packets.
@@ -383,8 +390,10 @@ def _clip(recording: Recording, path: Path, camera_named: bool, *groups: str) ->
     cameras = (build_camera_profile(scene, exposure),) if camera_named else ()
     options = ReceiverOptions(screens=(scene.screen,), cameras=cameras, force_camera=camera_named)
     about = {"screen": scene.screen.name, "camera": scene.camera_name, "hand_px": scene.hand_px}
-    truth = msgspec.convert(recording.truth("clip"), Truth, str_keys=True)
-    return Case(source=path, options=options, groups=groups, about=about, truth=truth, corners=exposure.corners)
+    whole = recording.truth("clip")
+    known: dict[str, Any] = {"truth": msgspec.convert(whole, Truth, str_keys=True), "whole_truth": whole}
+    corners = corners_on_picture(exposure.view, True) if scene.isp.correct_distortion else exposure.corners
+    return Case(source=path, options=options, groups=groups, about=about, corners=corners, **known)
 
 
 # Pictures without data.
@@ -453,18 +462,11 @@ def scene_at(
     scene = replace(scene, light_e_per_s=scene.light_e_per_s * light, pose=replace(scene.pose, **(pose or {})))
     scene = replace(scene, picture=picture, n_frames=1)
     if exposure_slots is not None:
-        scene = _exposed(scene, exposure_slots / screen.slot_rate_hz)
+        scene = scene.metered(exposure_slots / screen.slot_rate_hz)
     if megapixels is not None:
         factor = sqrt(megapixels / _XS10_MP)
         return scene.scaled(factor, keep_readout=True) if factor != 1 else scene
     return binned(scene, screen.columns * _PX_PER_COLUMN / scene.sensor.width) if is_binned else scene
-
-
-def _exposed(scene: Scene, exposure_s: float) -> Scene:
-    """The scene at another exposure, its gain turned so that white stays white."""
-    ratio = exposure_s / scene.exposure_s
-    sensor = replace(scene.sensor, full_scale_e=scene.sensor.full_scale_e * ratio)
-    return replace(scene, exposure_s=exposure_s, sensor=sensor)
 
 
 def binned(scene: Scene, share: float) -> Scene:
@@ -503,6 +505,15 @@ def draw_medium(at: Place) -> Iterator[Case]:
 #: What a scenario names as its drawing.
 DRAWERS: dict[str, Callable[[Place], Iterator[Case]]] = {
     drawer.__name__.removeprefix("draw_"): drawer
-    for drawer in (draw_phone, draw_screen, draw_confidence, draw_small, draw_motion, draw_clips, draw_nodata)
+    for drawer in (
+        draw_people,
+        draw_phone,
+        draw_screen,
+        draw_confidence,
+        draw_small,
+        draw_motion,
+        draw_clips,
+        draw_nodata,
+    )
 }
 DRAWERS |= {"point": draw_point, "capture": draw_capture, "medium": draw_medium}

@@ -70,10 +70,9 @@ class Group:
         """The packets of some confidence and more."""
         return [packet for packet in self.packets if packet["confidence"] >= least]
 
-    @cached_property
-    def wrong(self) -> int:
-        """Sure packets with a wrong bit; of a picture without data every packet is wrong."""
-        return sum(packet["bit_errors"] > 0 for packet in self.confident())
+    def wrong(self, least: float = SURE) -> int:
+        """Packets of some confidence with a wrong bit; of a picture without data every packet is wrong."""
+        return sum(packet["bit_errors"] > 0 for packet in self.confident(least))
 
     def values(self, name: str) -> list[Any]:
         """What the receptions hold under a name, as far as they do."""
@@ -158,6 +157,7 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "expected": lambda g: g.score.expected if g.scores else None,
     "right": lambda g: g.score.error_free if g.scores else None,
     "share": lambda g: g.score.error_free / max(g.yardstick.score.error_free, 1) if g.beside else None,
+    "share95": lambda g: wilson(g.score.error_free, max(g.yardstick.score.error_free, g.score.error_free)),
     "ber": lambda g: g.score.ber,
     "ber95": _ber_interval,
     "lost": lambda g: g.score.lost,
@@ -167,11 +167,12 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "right_packets": lambda g: sum(packet["bit_errors"] == 0 for packet in g.packets),
     "same": lambda g: sum(r.get("difference") is None for r in g.receptions),
     "cpu_ratio": lambda g: sum(g.values("cpu_s")) / sum(Group(g.cases, g.reference, g.reference).values("cpu_s")),
-    "packets_0.5": lambda g: len(g.confident(0.5)),
     "packets_0.9": lambda g: len(g.confident(0.9)),
     "sure": lambda g: len(g.confident()),
-    "surely_wrong": lambda g: g.wrong,
-    "at_most": lambda g: wilson(g.wrong, len(g.confident()))[1] if g.confident() else None,
+    "surely_wrong": lambda g: g.wrong(),
+    "likely": lambda g: len(g.confident(0.5)),
+    "likely_wrong": lambda g: g.wrong(0.5),
+    "at_most": lambda g: wilson(g.wrong(), len(g.confident()))[1] if g.confident() else None,
     "calibration": lambda g: calibration(g.packets)[1] if g.confident(1e-9) else None,
     "changed": lambda g: g.changed(),
     "problems": lambda g: len(g.problems),
@@ -239,9 +240,9 @@ def worth_a_look(records: Sequence[Record], ways: Sequence[str]) -> list[Row]:
     for record in records:
         for way in ways:
             group = Group([record], way, way)
-            if group.wrong or group.problems or (group.packets and not record["has_data"]):
+            if group.wrong() or group.problems or (group.packets and not record["has_data"]):
                 facts = " ".join(f"{key} {_rounded(value)}" for key, value in record["about"].items())
-                row = {"scene": facts, "way": way, "packets": len(group.packets), "surely_wrong": group.wrong}
+                row = {"scene": facts, "way": way, "packets": len(group.packets), "surely_wrong": group.wrong()}
                 table.append({**row, "problems": "; ".join(group.problems)})
     return table
 
@@ -259,7 +260,7 @@ def passes(records: Sequence[Record], ways: Sequence[str]) -> bool:
     group = Group(records, ways[0], ways[0])
     without_data = any(record["ways"][ways[0]]["packets"] for record in records if not record["has_data"])
     problems = any(Group(records, way, way).problems for way in ways)
-    return not (without_data or problems or wilson(group.wrong, len(group.confident()))[0] > 1 - SURE)
+    return not (without_data or problems or wilson(group.wrong(), len(group.confident()))[0] > 1 - SURE)
 
 
 # Calibration of the confidence.

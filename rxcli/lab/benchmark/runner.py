@@ -17,9 +17,10 @@ import msgspec
 from rxcli.errors import InputError
 from rxcli.ingest import KNOWN_SUFFIXES
 from rxcli.lab.benchmark import goodput
-from rxcli.lab.benchmark.cases import Record, bare, received
+from rxcli.lab.benchmark.cases import Case, Record, arguments_of, bare, received, write_case
 from rxcli.lab.benchmark.draw import DRAWERS, Place
 from rxcli.lab.benchmark.measures import COMMON, COMMON_COST
+from rxcli.outputs import write_whole
 from rxcli.resources import data_dir
 from rxcli.runs.processes import ONE_THREAD, environment
 
@@ -59,9 +60,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Measures of the table."""
         return self.columns or (*COMMON, *self.more, *COMMON_COST)
 
-    def tasks(self, seed: int, count: int, folder: Path, cae: str | None = None) -> list[Task]:
+    def tasks(self, seed: int, count: int, folder: Path, **more: str | None) -> list[Task]:
         """What is to be done: `count` numbers at every point."""
-        shared = {"draw": self.draw, "ways": self.ways, "seed": seed, "folder": str(folder), "cae": cae}
+        shared = {"draw": self.draw, "ways": self.ways, "seed": seed, "folder": str(folder), "cae": None, **more}
         return [
             {**shared, "number": number, "label": label, "point": {**self.base, **point}}
             for label, point in self.points.items()
@@ -90,14 +91,31 @@ def do(task: Task) -> list[Record]:
     oracle = "bound" in task["ways"]
     place = Place(task["seed"], task["number"], task["point"], Path(task["folder"]), oracle)
     records = []
-    for case in DRAWERS[task["draw"]](place):
+    for turn, case in enumerate(DRAWERS[task["draw"]](place)):
         if task["cae"] is not None:
             case = replace(case, options=replace(case.options, cae=task["cae"]))
         ways = {way: received(case, way) for way in task["ways"]}
         groups = [*filter(None, [task["label"]]), *case.groups]
         about = {"number": task["number"], **case.about}
+        if task.get("save"):
+            stem = Path(task["save"]) / "-".join(
+                [*task["label"].split(), str(task["seed"]), str(task["number"]), str(turn)]
+            )
+            save(case, stem, {"about": about, "groups": groups, "ways": ways})
         records.append({"about": about, "has_data": case.has_data, "groups": groups, **bare(case), "ways": ways})
     return records
+
+
+def save(case: Case, stem: Path, known: Record) -> None:
+    """Write a case as a file with truth and profiles, and `STEM.case.json`: corners, arguments, what is known.
+
+    The arguments under "named" name screen, camera and corners.
+    """
+    path = write_case(case, stem)
+    known |= {"file": path.name, "corners": None if case.corners is None else case.corners.tolist()}
+    known["arguments"] = arguments_of(path, case.options)
+    known["named"] = None if case.named is None else arguments_of(path, case.named)
+    write_whole(stem.with_name(stem.name + ".case.json"), json.dumps(known) + "\n")
 
 
 def load_journal(path: Path) -> dict[str, list[Record]]:

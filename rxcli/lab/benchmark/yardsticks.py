@@ -26,13 +26,12 @@ _THRESHOLD_SLOTS = 3 * SLOTS_PER_SYMBOL
 _SLOT_MIDDLE = 0.5
 
 
-def bound_result(trial: Trial | None) -> FrameResult:
+def bound_result(trial: Trial) -> FrameResult:
     """The genie, who knows outline, clock, light, picture and all other slots, and decides symbol by symbol.
 
     Args:
         trial: simulated with its oracle.
     """
-    assert trial is not None, "only a simulated frame has a bound"
     oracle, truth = trial.capture.oracle, trial.truth
     assert oracle is not None, "the bound needs a trial with oracle=True"
     columns = []
@@ -42,13 +41,12 @@ def bound_result(trial: Trial | None) -> FrameResult:
     return _result(columns)
 
 
-def paper_result(trial: Trial | None) -> FrameResult:
+def paper_result(trial: Trial) -> FrameResult:
     """The paper's pipeline, given the outline and the camera, on pixel values as they are stored.
 
     Undistort the whole frame, rectify the screen, average every column's pixels, threshold against the local mean, take
     what lies between two headers one packet apart, and choose the codeword of least Hamming distance.
     """
-    assert trial is not None, "the paper's pipeline is given a simulated frame"
     waves, rows_per_slot = column_waves(trial)
     lit = threshold(waves, rows_per_slot)
     screen = trial.capture.scene.screen

@@ -165,6 +165,16 @@ def draw_dark_picture(kind: str, rng: np.random.Generator, width: int, height: i
     return _DARK[kind](rng, width, height)
 
 
+def draw_part(name: str, rng: np.random.Generator, width: int, height: int, max_zoom: float = 1.5) -> Picture:
+    """Part of a picture, perhaps mirrored either way; (height, width, 3) uint8, red first."""
+    whole = load_picture(name, width, height)
+    zoom = rng.uniform(1.0, max_zoom)
+    w, h = int(width / zoom), int(height / zoom)
+    left, top = rng.integers(0, width - w + 1), rng.integers(0, height - h + 1)
+    part = cv2.resize(whole[top : top + h, left : left + w], (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.ascontiguousarray(part[:: rng.choice([1, -1]), :: rng.choice([1, -1])], np.uint8)
+
+
 def _photo(rng: np.random.Generator, width: int, height: int) -> Picture:
     picture = load_picture(str(rng.choice(_BRIGHT)), width, height)
     return np.ascontiguousarray(picture[:, ::-1] if rng.random() < 0.5 else picture)

@@ -127,6 +127,16 @@ class Scene:
         light_e_per_s = self.light_e_per_s * (self.exposure_s / exposure_s) * factor
         return replace(self, exposure_s=exposure_s, light_e_per_s=light_e_per_s)
 
+    def metered(self, exposure_s: float) -> Scene:
+        """The scene at another exposure, the gain set by it: white stays white, and electrons grow with the time."""
+        ratio = exposure_s / self.exposure_s
+        sensor = replace(self.sensor, full_scale_e=self.sensor.full_scale_e * ratio)
+        return replace(self, exposure_s=exposure_s, sensor=sensor, iso=max(round(self.iso / ratio), 25))
+
+    def read_in(self, readout_s: float) -> Scene:
+        """The scene before a sensor that reads all its rows in another time."""
+        return replace(self, sensor=replace(self.sensor, line_delay_s=readout_s / self.sensor.height))
+
     def scaled(self, x: float, y: float | None = None, *, keep_readout: bool = False) -> Scene:
         """The same view on a smaller sensor, for quick sweeps.
 

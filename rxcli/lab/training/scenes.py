@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.benchmark.draw import phone_of, screen_of
-from rxcli.lab.simulate.pictures import draw_dark_picture, load_picture
+from rxcli.lab.simulate.pictures import draw_dark_picture, draw_part
 from rxcli.lab.simulate.scenes import Scene, preset, random_scene
 
 #: scikit-image's pictures that training may use; the others are for validation.
@@ -48,16 +48,8 @@ def random_picture(rng: np.random.Generator, width: int, height: int) -> Picture
 
 
 def _photo_part(rng: np.random.Generator, width: int, height: int) -> NDArray[np.float64]:
-    import cv2
-
-    whole = load_picture(str(rng.choice(TRAINING_PHOTOS)), width, height)
-    zoom = rng.uniform(1.0, 2.5)
-    w, h = int(width / zoom), int(height / zoom)
-    left, top = rng.integers(0, width - w + 1), rng.integers(0, height - h + 1)
-    part = cv2.resize(whole[top : top + h, left : left + w], (width, height), interpolation=cv2.INTER_LINEAR)
-    part = part[:: rng.choice([1, -1]), :: rng.choice([1, -1])]
-    negative = rng.random() < 0.2
-    return np.asarray((255.0 - part if negative else part) / 255.0)
+    part = draw_part(str(rng.choice(TRAINING_PHOTOS)), rng, width, height, 2.5)
+    return np.asarray((255.0 - part if rng.random() < 0.2 else part) / 255.0)
 
 
 def _shapes(rng: np.random.Generator, width: int, height: int) -> NDArray[np.float64]:
