@@ -3,8 +3,6 @@
 `import rxcli` loads nothing heavy: each name is loaded when it is first used. docs/python.md shows how to use them.
 """
 
-from __future__ import annotations
-
 TYPE_CHECKING = False  # as type checkers take it; typing itself would cost milliseconds
 if TYPE_CHECKING:
     from typing import Any
@@ -52,7 +50,7 @@ _MODULE_OF = {name: module for module, names in _FROM.items() for name in names}
 __all__ = ["__version__", *_MODULE_OF]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> "Any":
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'rxcli' has no attribute {name!r}")
     from importlib import import_module

@@ -105,6 +105,20 @@ def shortened(text: str, length: int = 80) -> str:
     return text if len(text) <= length else f"{text[: length - 3]}..."
 
 
+def printable(text: str) -> str:
+    """`text` in one line that any terminal takes: other characters are escaped, `\\xff` is a byte that is no UTF-8."""
+    return "".join(character if character.isprintable() else _escape(character) for character in text)
+
+
+def _escape(character: str) -> str:
+    code = ord(character)
+    if 0xDC80 <= code <= 0xDCFF:  # a byte of a file name (PEP 383)
+        return f"\\x{code - 0xDC00:02x}"
+    return {"\n": "\\n", "\r": "\\r", "\t": "\\t"}.get(character) or (
+        f"\\u{code:04x}" if code < 1 << 16 else f"\\U{code:08x}"
+    )
+
+
 def capitalised(text: str) -> str:
     """`text` with a capital, for titles."""
     return text[:1].upper() + text[1:]

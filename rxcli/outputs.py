@@ -1,7 +1,7 @@
 """Output files of a run: checked together before any is opened, and written atomically.
 
 `claim` refuses outputs that would destroy an input, a profile, another output, a folder, or a foreign file. `replacing`
-and `write_whole` write to a hidden temporary file and rename it when it is complete, so that a kill or a full disk
+and `write_whole` write to a file in a hidden folder and rename it when it is complete, so that a kill or a full disk
 leaves the old file. Journals, which grow line by line, are the exception (`rxcli.runs.journal`).
 """
 
@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import mkstemp
+from tempfile import TemporaryDirectory, TemporaryFile
 from typing import TYPE_CHECKING
 
 from rxcli.errors import ExitCode, OutputError, ReceiverError, UsageError, reason_of
@@ -135,7 +135,7 @@ def claim(
                 taken.add(path, kind)
     for output in outputs:
         _check_place(output)
-        if _is_stream(output.path):
+        if is_stream(output.path):
             continue
         whose = taken.by(output.path)
         if whose is not None:
@@ -174,9 +174,7 @@ def _check_writable(output: Output) -> None:
 
 def _try_to_write(folder: Path) -> None:
     """Create and remove a file in a folder, since permissions do not show read-only file systems."""
-    handle, name = mkstemp(prefix=".vlc-rx-", suffix=".part", dir=folder)
-    os.close(handle)
-    Path(name).unlink(missing_ok=True)
+    TemporaryFile(prefix=".vlc-rx-", dir=folder).close()
 
 
 def _refusal(what: str, error: BaseException, step: str) -> ReceiverError:
@@ -233,7 +231,7 @@ def _check_place(output: Output) -> None:
         raise UsageError(f"{output}: {reason_of(error)}", "name another file") from None
 
 
-def _is_stream(path: Path) -> bool:
+def is_stream(path: Path) -> bool:
     """Whether `path` is a device or a pipe, which holds nothing to destroy."""
     try:
         return path.exists() and not path.is_file()
@@ -263,42 +261,46 @@ def _check_ours(output: Output) -> None:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path with the suffix of `path`, which replaces `path` if the block succeeds.
+def replacing(path: Path, follow: bool = True) -> Iterator[Path]:
+    """Yield a path of the same name in a new private folder, whose file replaces `path` if the block succeeds.
 
-    A device or a pipe is yielded itself. A link is followed. If the block fails, `path` is unchanged.
+    The file keeps the permissions of the one that it replaces, but no set-uid bit. If the block fails, `path` is
+    unchanged.
+
+    Args:
+        path: the output.
+        follow: write to the device, to the pipe, or to the target of the link that `path` is; otherwise replace it.
 
     Raises:
         OutputError: the file cannot be written; any `OSError` of the block ends so.
     """
-    target = path
     try:
-        if _is_stream(path):
+        if follow and is_stream(path):
             yield path
             return
-        target = path.resolve()
-        hidden = target.with_name(f".{target.stem[:100]}.{os.getpid()}.part{target.suffix}")
-        try:
+        target = path.resolve() if follow else path
+        with TemporaryDirectory(prefix=".vlc-rx-", dir=target.parent) as folder:
+            hidden = Path(folder, target.name)
             yield hidden
             with suppress(FileNotFoundError):
-                hidden.chmod(stat.S_IMODE(target.stat().st_mode))
+                mode = target.lstat().st_mode
+                if stat.S_ISREG(mode):
+                    hidden.chmod(mode & 0o777)
             hidden.replace(target)
-        finally:
-            hidden.unlink(missing_ok=True)
     except BrokenPipeError:
         raise
     except OSError as error:
         raise unwritable(path, error) from None
 
 
-def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file atomically.
+def write_whole(path: Path, content: str | bytes, follow: bool = True) -> None:
+    """Write a file atomically; arguments as of `replacing`.
 
     Raises:
         OutputError: it cannot be written.
     """
     data = content.encode() if isinstance(content, str) else content
-    with replacing(path) as hidden:
+    with replacing(path, follow) as hidden:
         hidden.write_bytes(data)
 
 
@@ -320,6 +322,8 @@ def check_replaceable(path: Path, ours: re.Pattern[bytes], option: str) -> None:
     Raises:
         OutputError: `path` exists and does not match `ours`.
     """
+    if is_stream(path):
+        raise OutputError(f"{path}: is no file", "remove it, or name another folder")
     try:
         _check_ours(Output(option, path, ours))
     except UsageError as error:

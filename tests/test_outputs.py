@@ -16,8 +16,11 @@ from small_frames import write_frame, write_profiles
 
 from rxcli import outputs
 from rxcli.cli.main import run
-from rxcli.errors import OutputError, UsageError
+from rxcli.errors import InputError, OutputError, UsageError
+from rxcli.link.saving import save_object
 from rxcli.outputs import Output, claim, replacing, write_whole
+from rxcli.results.dump import dump_stages
+from rxcli.types import ReceivedObject
 
 
 @pytest.fixture
@@ -168,6 +171,43 @@ def test_a_link_is_followed_and_a_device_is_no_file(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match=f"{path}: cannot be written") as caught:
             write_whole(Path(path), "new")
         assert caught.value.exit_code == code
+
+
+def test_a_temporary_file_is_not_where_a_link_may_wait_and_is_never_set_uid(tmp_path: Path) -> None:
+    path, victim = tmp_path / "a.txt", tmp_path / "victim"
+    victim.write_text("mine")
+    path.write_text("old")
+    path.chmod(0o4755)
+    (tmp_path / f".a.{os.getpid()}.part.txt").symlink_to(victim)
+    with replacing(path) as hidden:
+        assert hidden.parent.stat().st_mode & 0o777 == 0o700
+        hidden.write_text("new")
+    assert (path.read_text(), path.stat().st_mode & 0o7777) == ("new", 0o755)
+    assert victim.read_text() == "mine"
+
+
+@pytest.mark.parametrize("kind", ["pipe", "link"])
+def test_a_received_file_replaces_a_pipe_or_a_link_and_is_not_written_into_it(kind: str, tmp_path: Path) -> None:
+    path, victim = tmp_path / "out" / "a.txt", tmp_path / "victim"
+    path.parent.mkdir()
+    victim.write_text("mine")
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to(victim)
+    received = ReceivedObject("a.txt", b"sent", 4, "00", 1, 1, "", 0, 0.0)
+    with pytest.raises(InputError, match="exists with other content"):
+        save_object(received, path.parent)
+    save_object(received, path.parent, force=True)
+    assert path.is_file()
+    assert not path.is_symlink()
+    assert (path.read_bytes(), victim.read_text()) == (b"sent", "mine")
+
+
+def test_a_pipe_with_the_name_of_a_tap_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.jpg-000000.npz")
+    with pytest.raises(OutputError, match="is no file"):
+        dump_stages(tmp_path, "a.jpg", 0, {})
 
 
 def test_taps_of_files_with_one_name_stand_in_their_folders(

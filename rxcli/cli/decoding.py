@@ -15,7 +15,6 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
 
-import click
 import msgspec
 
 from rxcli import __version__, outputs
@@ -272,7 +271,7 @@ class _Run:
         from rxcli.receiver.camera import camera_profile
 
         if self._estimated is None:
-            click.echo(f"vlc-rx: {path} was not written: no packet was received with an estimated camera", err=True)
+            log.error("%s was not written: no packet was received with an estimated camera", path)
             return
         frame = next(iter(open_source(self._paths[self._estimated.source])))
         about = frame.metadata
@@ -299,7 +298,7 @@ class _Run:
                 if self._given[name]:
                     write(self._given[name])
             except ReceiverError as error:
-                click.echo(f"vlc-rx: {error}", err=True)
+                log.error("%s", error)
                 codes.append(error.exit_code)
         self._print_summary()
         return codes
@@ -310,7 +309,7 @@ class _Run:
             for counted in self._summaries:
                 for _, reason in counted.failures(self._limits):
                     name = "" if reason.startswith(f"{counted.source}: ") else f"{counted.source}: "
-                    click.echo(f"vlc-rx: {report.printable(name + reason)}", err=True)
+                    log.error("%s%s", name, reason)
         elif self._summaries:
             if self._output.has_table:
                 print_text(report.LEGEND + "\n")

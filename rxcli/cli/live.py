@@ -17,7 +17,7 @@ import click
 
 from rxcli.cli.common import claim_outputs, force_argument, options, receiver_arguments, receiver_options
 from rxcli.cli.kinds import FOLDER, Exposure
-from rxcli.errors import ExitCode, UsageError
+from rxcli.errors import ExitCode, UsageError, printable
 
 if TYPE_CHECKING:
     from rxcli.ingest.v4l2 import CameraCounts, CameraSettings, LiveSource
@@ -275,4 +275,4 @@ def _coloured(line: str, locked: bool) -> str:
 
 
 def _say(line: str) -> None:
-    click.echo(line, err=True)
+    click.echo(printable(line), err=True)

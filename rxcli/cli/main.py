@@ -22,7 +22,7 @@ import click
 
 from rxcli import __version__
 from rxcli.cli.groups import SuggestingGroup
-from rxcli.errors import ExitCode, OutputError, ReceiverError, Terminated
+from rxcli.errors import ExitCode, OutputError, ReceiverError, Terminated, printable
 
 _COMMANDS = {
     "demo": "Try it without a screen: a simulated photo with a text.",
@@ -125,6 +125,8 @@ def main() -> None:
     # Our matrices are small: threads inside their products spin more than they help, and numpy is not loaded yet.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _reserve_standard_streams()
+    os.environ["PYTHONSAFEPATH"] = "1"  # no child takes modules from the current folder
+    sys.path[:] = filter(None, sys.path)
     signal.signal(signal.SIGTERM, _terminate)
     code = run(sys.argv[1:])
     gc.freeze()  # else the interpreter looks for garbage among all objects once more before it ends
@@ -217,10 +219,10 @@ class _StderrHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         traceback = logging.Formatter().formatException(record.exc_info) if record.exc_info else ""
-        level, message = record.levelname, record.getMessage()
+        level, message = record.levelname, printable(record.getMessage())
         text = f"vlc-rx: {'' if level == 'ERROR' else f'{level}: '}{message}" + f"\n{traceback}" * bool(traceback)
         if self.as_json:
-            about = {"time": round(record.created, 3), "level": level.lower(), "message": message}
+            about = {"time": round(record.created, 3), "level": level.lower(), "message": record.getMessage()}
             text = json.dumps(about | ({"traceback": traceback} if traceback else {}))
         with suppress(OSError):  # nobody hears that nobody hears
             click.echo(text, err=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, known_pro
 from rxcli.resources import user_dir
 from rxcli.types import Frame
 
+log = logging.getLogger(__name__)
 _JSON = options(("--json=FILE|- json_path", click.Path(allow_dash=True), None, "Write JSON."))
 
 
@@ -87,7 +89,7 @@ def validate(names: tuple[str, ...]) -> int:
         try:
             profile = load_profile(name)
         except ReceiverError as error:
-            click.echo(f"vlc-rx: {error}", err=True)
+            log.error("%s", error)
             codes.append(error.exit_code)
         else:
             click.echo(f"{name}: valid {profile.kind} profile {profile.name!r}")
@@ -109,7 +111,7 @@ def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | No
         try:
             records.append(_choice(_first_frame(path), path, known))
         except InputError as error:
-            click.echo(f"vlc-rx: {error}", err=True)
+            log.error("%s", error)
             codes.append(error.exit_code)
     if json_path is not None:
         write_json(records, json_path)

@@ -38,9 +38,7 @@ def save_object(
         if os.path.lexists(path) and not force:
             step = "give --force to overwrite it, or another folder"
             raise InputError(f"{path} exists with other content; {lost}", step)
-        if path.is_symlink():  # the link itself is replaced, never its target
-            path.unlink(missing_ok=True)
-        write_whole(path, received.data)
+        write_whole(path, received.data, follow=False)
     taken.add(path, "a file received before")
     return replace(received, path=str(path))
 

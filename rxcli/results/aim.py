@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.errors import sentence
-from rxcli.results.report import printable
+from rxcli.errors import printable, sentence
 from rxcli.types import FloatArray, Frame, FrameResult
 
 #: Rates are averages over this time, seconds.

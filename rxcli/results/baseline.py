@@ -38,8 +38,9 @@ class Baseline:
     current: dict[str, Run] = field(default_factory=dict)
 
     def add(self, result: FrameResult) -> None:
-        """Count a frame of the current run."""
-        self._count(result, self.current)
+        """Count a frame of the current run if its source was in the earlier one, for cameras send without end."""
+        if os.path.normpath(result.source) in self.earlier:
+            self._count(result, self.current)
 
     def _count(self, result: FrameResult, runs: dict[str, Run]) -> None:
         run, total = runs.setdefault(os.path.normpath(result.source), Run()), result.timing_ms.get("total", 0.0)

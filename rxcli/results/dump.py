@@ -82,7 +82,7 @@ def dump_stages(folder: Path, source: str, frame: int, stages: Mapping[str, Any]
     path = folder / f"{plain_name(source)}-{frame:06d}.npz"
     make_parent(path)
     check_replaceable(path, TAPS, "--dump-dir")
-    with replacing(path) as hidden:
+    with replacing(path, follow=False) as hidden:
         np.savez(hidden, **arrays)
     return path
 

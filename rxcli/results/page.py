@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rxcli.errors import printable
 from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.resources import data_dir
 from rxcli.results.aim import height_share, light_of, split_message
@@ -19,7 +20,7 @@ from rxcli.results.inspection import Inspection, Trace, inspect_frame
 from rxcli.results.maps import column_map
 from rxcli.results.overlay import picture_of, preview
 from rxcli.results.record import plain
-from rxcli.results.report import headline, mirror_note, printable
+from rxcli.results.report import headline, mirror_note
 from rxcli.types import FloatArray, Frame, FrameResult
 
 #: First lines of a page that this program wrote.

@@ -11,7 +11,7 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Any
 
-from rxcli.errors import capitalised
+from rxcli.errors import capitalised, printable
 from rxcli.results.columns import PACKET_TABLE, PAYLOAD_TABLE, packet_rows
 from rxcli.results.record import plain
 from rxcli.types import FrameResult, Message, ObjectProgress, ReceivedObject
@@ -94,20 +94,6 @@ def payload_rows(result: FrameResult) -> Iterator[list[Any]]:
     for packet in packet_rows(result):
         written = {"source": printable_name(result.source), "confidence": f"{packet['confidence']:.6f}"}
         yield [(packet | written)[key] for key in PAYLOAD_TABLE.values()]
-
-
-def printable(text: str) -> str:
-    """`text` in one line that any terminal takes: other characters are escaped, `\\xff` is a byte that is no UTF-8."""
-    return "".join(character if character.isprintable() else _escape(character) for character in text)
-
-
-def _escape(character: str) -> str:
-    code = ord(character)
-    if 0xDC80 <= code <= 0xDCFF:  # a byte of a file name (PEP 383)
-        return f"\\x{code - 0xDC00:02x}"
-    return {"\n": "\\n", "\r": "\\r", "\t": "\\t"}.get(character) or (
-        f"\\u{code:04x}" if code < 1 << 16 else f"\\U{code:08x}"
-    )
 
 
 def printable_name(name: str) -> str:

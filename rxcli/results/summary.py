@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rxcli.errors import ExitCode, UsageError, worst
+from rxcli.errors import ExitCode, UsageError, printable, worst
 from rxcli.outputs import replacing, write_whole
 from rxcli.results import report
-from rxcli.results.report import count_packets, plural, printable, printable_name
+from rxcli.results.report import count_packets, plural, printable_name
 from rxcli.results.truth import EXPECTED_LENGTHS, Fault, Score
 from rxcli.types import BELIEVABLE, FrameResult
 

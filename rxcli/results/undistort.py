@@ -113,7 +113,7 @@ class UndistortedWriter:
         path = self.folder / subfolder / f"{Path(frame.source).name}.{frame.index:05d}.png"
         make_parent(path)
         check_replaceable(path, PICTURE, "--save-undistorted")
-        write_whole(path, encode_png(undistorted(frame, lens)))
+        write_whole(path, encode_png(undistorted(frame, lens)), follow=False)
         return True
 
     @staticmethod

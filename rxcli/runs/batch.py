@@ -6,6 +6,7 @@ Results come source by source in the order of the input in either case; `rxcli.r
 from __future__ import annotations
 
 import logging
+import logging.handlers
 import os
 import signal
 from collections import Counter, deque
@@ -17,6 +18,7 @@ from importlib import import_module
 from itertools import chain, islice
 from queue import SimpleQueue
 from threading import Lock, Semaphore, Thread, local
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError, reason_of
@@ -389,7 +391,10 @@ class _Pool:
             while (message := connection.recv()) is not None:
                 if isinstance(message, Exception):
                     raise message
-                yield message
+                if isinstance(message, logging.LogRecord):
+                    logging.getLogger(message.name).handle(message)
+                else:
+                    yield message
         except (EOFError, OSError):
             process.join()
             connection.close()
@@ -420,7 +425,8 @@ def _work(connection: Connection, decoder: Decoder, level: int) -> None:
     for number in _FIRST_DECIDES:
         signal.signal(number, signal.SIG_IGN)
     _hold_signals(signal.SIG_UNBLOCK)
-    logging.basicConfig(level=level)
+    to_first: Any = SimpleNamespace(put_nowait=connection.send)  # which writes the records in its own form
+    logging.basicConfig(level=level, handlers=[logging.handlers.QueueHandler(to_first)])
     use_one_thread()
     try:
         while True:

@@ -151,7 +151,7 @@ def _write(taps: list[_Tap], decoder: Decoder) -> None:
         path = _folders(decoder)[option] / below
         make_parent(path)
         check_replaceable(path, {"--dump-dir": TAPS, "--save-undistorted": PICTURE}[option], option)
-        write_whole(path, data)
+        write_whole(path, data, follow=False)
 
 
 def _await(source: Source, future: Any, address: str) -> _Outcome:

@@ -3,22 +3,24 @@
 Every line is written in one call, and sources follow one another, so after a kill only the last source can be
 incomplete. `Journal.recover` drops it, and sources whose decoder was killed, and the run continues after the rest. The
 first line holds version and options under `run`, the first line of every source length and time of its file under
-`file`, and its last line `last`. Resuming with other options or changed files is refused.
+`file`, and its last line `last`. Resuming with other options is refused; changed files are decoded again.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 import stat
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from io import FileIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from rxcli.errors import InputError, UsageError, shortened
-from rxcli.outputs import replacing, unwritable
+from rxcli.outputs import is_stream, replacing, unwritable
 from rxcli.results.record import from_record, to_record
 from rxcli.types import FrameResult
 
@@ -26,6 +28,8 @@ try:
     import fcntl
 except ImportError:  # no such locks on this system
     fcntl = None  # type: ignore[assignment]
+
+log = logging.getLogger(__name__)
 
 #: Start of every line of results, which distinguishes a truncated line from a foreign file.
 _LINE_START = b'{"source": "'
@@ -120,6 +124,8 @@ class Journal:
     def __init__(self, path: Path, resume: bool = False) -> None:
         self._path = path
         self._open_files = ExitStack()
+        if path.is_symlink() and not is_stream(path):
+            raise UsageError(f"{path}: is a link, and could lead elsewhere during the run", "name the file itself")
         self._open()
         if self._regular and not resume:
             self._file.truncate(0)
@@ -127,7 +133,8 @@ class Journal:
     def _open(self) -> None:
         """Open and lock the file. One that it replaces stays locked, so that no other run goes on in that."""
         try:
-            self._file: BinaryIO = self._open_files.enter_context(self._path.open("ab", buffering=0))
+            opener = None if is_stream(self._path) else _open_no_link
+            self._file = self._open_files.enter_context(FileIO(self._path, "a", opener=opener))
             self._regular = stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
         except (OSError, ValueError) as error:
             self.close()
@@ -166,36 +173,40 @@ class Journal:
     ) -> Iterator[tuple[str, list[FrameResult]]]:
         """Give the complete sources of an earlier run, then leave only them in the file. Exhaust it before `append`.
 
-        The last source may be incomplete, and is dropped; so are sources marked `retry`.
+        The last source may be incomplete, and is dropped; so are sources marked `retry`, and those whose files have
+        changed.
 
         Args:
             head: of the run that goes on; None: not compared.
             paths: name -> path of the sources of this run; other sources are kept.
 
         Raises:
-            UsageError: the file is no output of `vlc-rx decode --json`, or was written with other options or of other
-                files; it is left as it is.
+            UsageError: the file is no output of `vlc-rx decode --json`, or was written with other options; it is left
+                as it is.
             InputError: it cannot be read.
             OutputError: it cannot be written.
         """
         if not self._regular:
             return
-        if head is not None:
-            _check_same(self._path, head, paths or {})
         run: Any = None
+        facts: object = None
         lines: list[bytes] = []
         results: list[FrameResult] = []
-        with replacing(self._path) as hidden, hidden.open("wb") as out:
-            for place, line, record in _records(self._path):
+        with replacing(self._path, follow=False) as hidden, hidden.open("wb") as out:
+            for number, (place, line, record) in enumerate(_records(self._path)):
                 run = record.get("run", run)
+                if number == 0 and head is not None:
+                    _check_same(self._path, head, run)
                 result = _result(record, place)
                 if results and result.source != results[0].source:
                     lines, results = [], []
+                if not results:
+                    facts = record.get("file")
                 lines.append(line)
                 results.append(result)
                 if record.get("last") is not True:
                     continue
-                if not any(result.retry for result in results):
+                if not any(result.retry for result in results) and not _has_changed(result.source, facts, paths or {}):
                     if out.tell() == 0 and run is not None:  # the first line keeps the record of the run
                         lines[0] = json.dumps({**json.loads(lines[0]), "run": run}).encode() + b"\n"
                     out.writelines(lines)
@@ -213,8 +224,9 @@ def _records(path: Path) -> Iterator[tuple[str, bytes, dict[str, Any]]]:
     try:
         with path.open("rb") as file:
             for number, line in enumerate(file, start=1):
-                if not line.endswith(b"\n") and line[: len(_LINE_START)] == _LINE_START[: len(line)]:
-                    return  # cut by a kill
+                cut = line.rstrip(b"\0")[: len(_LINE_START)]  # a machine that stops leaves zeros behind it
+                if not line.endswith(b"\n") and _LINE_START.startswith(cut):
+                    return
                 place = f"{path} line {number}"
                 try:
                     record = json.loads(line)
@@ -227,30 +239,27 @@ def _records(path: Path) -> Iterator[tuple[str, bytes, dict[str, Any]]]:
         raise InputError(f"{path}: cannot be resumed ({error.strerror})", "name another file") from None
 
 
-def _check_same(path: Path, head: Head, paths: Mapping[str, str]) -> None:
-    """Refuse to mix what does not go together, before anything is changed."""
-    problems: list[str] = []
-    source = None
-    for number, (_, _, record) in enumerate(_records(path)):
-        if number == 0:
-            problems += head.differences(record.get("run"))
-        if record.get("source") != source:
-            source = record.get("source")
-            problems += _changes(str(source), record.get("file"), paths)
-    if problems:
+def _check_same(path: Path, head: Head, run: object) -> None:
+    """Refuse to mix results of different options, before anything is changed."""
+    if problems := head.differences(run):
         more = f" (and {len(problems) - 3} other differences)" if len(problems) > 3 else ""
         raise UsageError(
             f"{path}: cannot be resumed, results would not go together: {'; '.join(problems[:3])}{more}",
-            "run it with the same options and files, or name another file with --json",
+            "run it with the same options, or name another file with --json",
         )
 
 
-def _changes(source: str, facts: object, paths: Mapping[str, str]) -> list[str]:
-    """How the file of a source differs from what it was."""
-    if source not in paths:
-        return []
-    changed = _differences(facts if isinstance(facts, dict) else {}, file_facts(paths[source]) or {})
-    return [f"{source} has changed ({', '.join(changed)})"] if changed else []
+def _has_changed(source: str, facts: object, paths: Mapping[str, str]) -> bool:
+    """Whether the file of a source is there and is another one than before; a warning states the difference."""
+    current = file_facts(paths[source]) if source in paths else None
+    changed = _differences(facts if isinstance(facts, dict) else {}, current) if current else []
+    if changed:
+        log.warning("%s has changed (%s); it is decoded again", source, ", ".join(changed))
+    return bool(changed)
+
+
+def _open_no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
 def _result(record: dict[str, Any], place: str) -> FrameResult:

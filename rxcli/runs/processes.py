@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ THREAD_VARIABLES = (
 )
 #: A process whose libraries start no threads of their own.
 ONE_THREAD = dict.fromkeys(THREAD_VARIABLES, "1")
+_STARTING = Lock()
 
 
 @contextmanager
@@ -63,13 +65,15 @@ def peak_memory_mb() -> float:
 def start_process(work: Callable[..., None], *arguments: Any) -> tuple[BaseProcess, Connection]:
     """Start `work(connection, *arguments)` in a fresh Python, and give our end of the connection.
 
-    A process is never forked: one that has threads can lock up.
+    A process is never forked: one that has threads can lock up. It takes no modules from the current folder, which may
+    be that of somebody's files.
     """
     from multiprocessing import get_context
 
     context = get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=work, args=(theirs, *arguments), daemon=True)
-    process.start()
+    with _STARTING, environment({"PYTHONSAFEPATH": "1"}):
+        process.start()
     theirs.close()
     return process, ours

@@ -99,6 +99,37 @@ def test_wrong_usage_is_one_line_and_exit_code_2(
     assert captured.err.count("\n") == 1
 
 
+#: Modules that a run loads: ours, of the standard library, of packages; here they leave a mark when they are loaded.
+MODULES = ("multiprocessing", "__future__", "signal", "click", "json", "numpy", "rxcli")
+
+
+@pytest.mark.parametrize("way", ["script", "module"])
+def test_no_module_is_taken_from_the_current_folder(way: str, tmp_path: Path) -> None:
+    """A folder of photos may be anybody's."""
+    script, photos = tmp_path / "vlc-rx", tmp_path / "photos"
+    script.write_text("from rxcli.cli.main import main\nif __name__ == '__main__':\n    main()\n")
+    photos.mkdir()
+    for name in MODULES if way == "script" else MODULES[:-1]:  # `python -m` has to find the package first
+        (photos / f"{name}.py").write_text(f"open({str(tmp_path / 'loaded')!r}, 'a').write({name!r})")
+    for name in ("a.jpg", "b.jpg"):
+        (photos / name).write_bytes(b"\xff\xd8\xff cut")
+    command = [sys.executable, *([str(script)] if way == "script" else ["-m", "rxcli.cli.main"])]
+    done = subprocess.run([*command, "decode", ".", "--workers", "2"], cwd=photos, env=ENVIRONMENT, check=False)
+    assert done.returncode == 3
+    assert not (tmp_path / "loaded").exists()
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_names_of_files_in_warnings_and_logs_are_printable(workers: str, tmp_path: Path) -> None:
+    """They may hold what clears a terminal, or turns its text round."""
+    for name in ("a\x1b[2J\u202egpj.jpg", "b.jpg"):
+        (tmp_path / name).write_bytes(b"\xff\xd8\xff cut")
+    command = [sys.executable, "-m", "rxcli.cli.main", "decode", ".", "--workers", workers, "--verbose"]
+    done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert "a\\u001b[2J\\u202egpj.jpg" in done.stderr
+    assert all(line.isprintable() for line in done.stderr.splitlines())
+
+
 def test_logs_as_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["decode", "a", "--resume", "--log-json"]) == 2
     line = json.loads(capsys.readouterr().err)

@@ -131,7 +131,7 @@ def test_a_received_file_replaces_nothing_of_its_run(
     assert "--dump-dir writes there" in said
 
 
-def test_resuming_with_other_options_or_changed_files_is_refused(tmp_path: Path, folder: Path, decode: Decode) -> None:
+def test_resuming_with_other_options_is_refused(tmp_path: Path, folder: Path, decode: Decode) -> None:
     out, screen = tmp_path / "o.jsonl", tmp_path / "profiles" / "screen.toml"
     assert decode(folder / "0.png", folder / "1.png", "--json", out)[0] == 0
     before = out.read_bytes()
@@ -148,13 +148,26 @@ def test_resuming_with_other_options_or_changed_files_is_refused(tmp_path: Path,
 
     assert "--min-confidence was null, is 0.5" in refused("--min-confidence", "0.5")
     assert "--cae was" in refused("--cae", "never")
-    os.utime(folder / "1.png", (1, 1))
-    assert f"{folder / '1.png'} has changed (modified_s was" in refused()
     (folder / "1.png").unlink()
-    assert decode(folder, "--json", out, "--resume")[0] == 0  # no longer asked for: kept
-    assert out.read_bytes() == whole
+    for paths in ((folder,), (folder, folder / "1.png")):  # no longer there, asked for or not: kept
+        assert decode(*paths, "--json", out, "--resume")[0] == 0
+        assert out.read_bytes() == whole
     screen.write_text(screen.read_text().replace("0.45", "0.55"))
     assert "--profiles was" in refused()
+
+
+def test_files_that_changed_since_the_journal_are_decoded_again(tmp_path: Path, folder: Path, decode: Decode) -> None:
+    out = tmp_path / "o.jsonl"
+    assert decode(folder, "--json", out)[0] == 0
+    before, payloads = records(out), write_frame(folder / "1.png", 7)
+    code, said = decode(folder, "--json", out, "--resume")
+    assert code == 0
+    assert f"{folder / '1.png'} has changed (" in said
+    after = records(out)
+    assert [record["source"][-5:] for record in after] == ["0.png", "2.png", "1.png"]
+    assert [column["packets"][0]["payload"] for column in after[2]["columns"]] == payloads
+    assert after[0] == before[0]  # what the first line says of the run stays
+    assert after[1] == before[2]
 
 
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs Linux's /proc")

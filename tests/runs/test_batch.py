@@ -129,11 +129,13 @@ def write_journal(path: Path, names: str) -> bytes:
     return path.read_bytes()
 
 
+@pytest.mark.parametrize("zeros", [0, 5000])
 @pytest.mark.parametrize("cut", range(0, 60, 7))
-def test_recover_drops_a_half_line_and_the_source_it_belongs_to(tmp_path: Path, cut: int) -> None:
+def test_recover_drops_a_half_line_and_the_source_it_belongs_to(tmp_path: Path, cut: int, zeros: int) -> None:
+    """A machine that stops may leave zeros behind the half line."""
     path = tmp_path / "out.jsonl"
     whole = write_journal(path, "aabccc")
-    path.write_bytes(whole[: len(whole) - cut])
+    path.write_bytes(whole[: len(whole) - cut] + bytes(zeros))
     n_kept = 3 if cut else 6
     journal = Journal(path, resume=True)
     whole_sources = [("a", 2), ("b", 1), ("c", 3)][: n_kept // 3 + 1]
@@ -168,6 +170,19 @@ def test_recover_leaves_a_foreign_file_alone(tmp_path: Path, text: str) -> None:
     with closing(Journal(path, resume=True)) as journal, pytest.raises(UsageError, match="line 1"):
         list(journal.recover())
     assert path.read_text() == text
+
+
+def test_a_journal_is_not_written_through_a_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither one that is there, nor one that is put there after the last look."""
+    path, victim = tmp_path / "out.jsonl", tmp_path / "victim"
+    victim.write_text("mine")
+    path.symlink_to(victim)
+    with pytest.raises(UsageError, match="is a link"):
+        Journal(path)
+    monkeypatch.setattr(Path, "is_symlink", lambda _: False)
+    with pytest.raises(InputError, match="cannot be written"):
+        Journal(path)
+    assert victim.read_text() == "mine"
 
 
 def test_a_journal_that_cannot_be_written_says_so(tmp_path: Path) -> None:
