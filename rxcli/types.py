@@ -453,6 +453,9 @@ class FrameResult:
     #: Whether the picture is mirrored, with columns counted from its right: on request, or because a text or a file
     #: decoded only that way. None: undecided, since the file names a front camera.
     mirrored: bool | None = False
+    #: Quarter turns, counter-clockwise, by which the stored picture was turned to be received; `first_row` is then a
+    #: row of the picture so turned.
+    quarter_turns: int = 0
     camera_profile: str | None = None
     line_delay_s: float | None = None
     exposure_s: float | None = None

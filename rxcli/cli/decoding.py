@@ -269,11 +269,12 @@ class _Run:
 
     def _save_camera(self, path: Path) -> None:
         from rxcli.receiver.camera import camera_profile
+        from rxcli.receiver.turned import as_received
 
         if self._estimated is None:
             log.error("%s was not written: no packet was received with an estimated camera", path)
             return
-        frame = next(iter(open_source(self._paths[self._estimated.source])))
+        frame, _ = as_received(next(iter(open_source(self._paths[self._estimated.source]))), self._estimated)
         about = frame.metadata
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).lstrip("._-") or "camera"
         profile = camera_profile(self._estimated.estimated, name, about.make, about.model, frame.width, frame.height)

@@ -11,6 +11,9 @@ from rxcli.receiver.context import DEFAULT_TONE, Camera, Failure
 from rxcli.receiver.screen import geometry
 from rxcli.types import Frame, FrameResult, Lens
 
+#: Relative difference of line delays up to which an estimate agrees with a profile, and confidence of a sure packet.
+_SAME_LINE_DELAY, _SURE = 0.01, 0.9
+
 
 def known_camera(frame: Frame, options: ReceiverOptions) -> Camera | Failure | None:
     """Camera from the matching profile, or None."""
@@ -48,6 +51,21 @@ def with_estimates(frame: Frame, options: ReceiverOptions) -> Iterator[tuple[Fra
         yield frame, estimated
     if frame.metadata.exposure_s is not None:
         yield replace(frame, metadata=replace(frame.metadata, exposure_s=None)), estimated
+
+
+def is_credible(estimated: FrameResult, frame: Frame, options: ReceiverOptions) -> bool:
+    """Whether a result with an estimated camera outweighs a profile; one with another line delay needs sure packets.
+
+    Under a screen that is not the one in the picture, an estimate of the camera may fit what a profile rules out.
+    """
+    known, line_delay_s = known_camera(frame, options), estimated.line_delay_s
+    if not isinstance(known, Camera) or line_delay_s is None:
+        return True
+    if abs(line_delay_s / known.line_delay_s - 1) < _SAME_LINE_DELAY:
+        return True
+    lit = [column for column in estimated.columns if column.status != "dark"]
+    n_sure = sum(any(p.confidence > _SURE for p in column.packets) for column in lit)
+    return 2 * n_sure > len(lit)
 
 
 def difference(

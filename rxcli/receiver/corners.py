@@ -14,6 +14,7 @@ from rxcli.receiver.plane import turned
 from rxcli.receiver.screen import find, geometry
 from rxcli.receiver.screen.bright import bright_quadrilateral
 from rxcli.receiver.settings import SETTINGS
+from rxcli.receiver.turned import PORTRAIT
 from rxcli.types import FloatArray, Frame
 
 _TOO_SLOW = (
@@ -22,8 +23,10 @@ _TOO_SLOW = (
 #: Log-odds of the bright part of a picture against columns that were found; probability that it is the whole screen, if
 #: it shows packets; and the share of its width within which corners are the same.
 _BRIGHT_LOG_ODDS, _BRIGHT_CERTAINTY, _SAME_OUTLINE = -50.0, 0.9, 0.025
-#: Orientations in which the readout runs along the columns' width.
-_PORTRAIT = (5, 6, 7, 8)
+ON_ITS_SIDE = (
+    "the screen's columns lie along the rows of the picture, as in portrait or where a picture was turned after it was "
+    "taken; use the camera's own file, taken in landscape"
+)
 _NO_COLUMNS = "no columns of a modulated backlight were found in the picture"
 _SHOW_COLUMNS = (
     "photograph a screen that sends, from near, with the electronic shutter and a short exposure (1/8000 s), and use "
@@ -49,7 +52,7 @@ def proposed_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> li
 
 def no_screen(frame: Frame, options: ReceiverOptions, timer: Timer) -> Failure:
     """Failure of a picture without a screen."""
-    reason = turned_pixels(frame, options, timer) or reason_for_none(frame)  # Pixels may lie on their side.
+    reason = ON_ITS_SIDE if lies_on_its_side(frame, options, timer) else reason_for_none(frame)
     return Failure("no_screen", f"no screen found: {reason}")
 
 
@@ -110,7 +113,7 @@ def _as_viewed(outline: Outline, orientation: int) -> Outline:
 def unreadable_orientation(frame: Frame) -> Failure | None:
     """Failure of a picture whose readout runs along the columns' width, or None."""
     orientation = frame.metadata.orientation
-    if orientation not in _PORTRAIT:
+    if orientation not in PORTRAIT:
         return None
     return Failure(
         "no_signal",
@@ -156,16 +159,11 @@ def whole_picture(frame: Frame) -> FloatArray:
     return geometry.viewer_order(corners, frame.metadata.orientation)
 
 
-def turned_pixels(frame: Frame, options: ReceiverOptions, timer: Timer) -> str | None:
-    """Message about a picture that was rotated by 90 degrees, or None. Of a clip only the first frame is examined."""
+def lies_on_its_side(frame: Frame, options: ReceiverOptions, timer: Timer) -> bool:
+    """Whether columns lie along the rows of a picture. Of a clip only the first frame is examined."""
     wide = [layout for layout in layouts_of(options) if not layout.is_narrow]
     screens = [] if frame.index else find.find_screens(turned(timer.planes.plane(frame)), wide)
-    if not any(screen[0].stands_out for screen in screens):
-        return None
-    return (
-        "the picture was turned by 90 degrees after it was taken, or taken in portrait: its stripes run downwards; use "
-        "the camera's own file, taken in landscape"
-    )
+    return any(screen[0].stands_out for screen in screens)
 
 
 def reason_for_none(frame: Frame) -> str:

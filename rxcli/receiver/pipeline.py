@@ -15,10 +15,18 @@ from typing import Any
 from rxcli.numerics import one_blas_thread
 from rxcli.options import SKIPS, CaeMode, ReceiverOptions
 from rxcli.profiles import ScreenProfile
+from rxcli.receiver import turned
 from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.cameras import difference, with_estimates
+from rxcli.receiver.cameras import difference, is_credible, with_estimates
 from rxcli.receiver.context import Failure, Outline, Timer
-from rxcli.receiver.corners import no_screen, proposed_screens, too_small
+from rxcli.receiver.corners import (
+    ON_ITS_SIDE,
+    lies_on_its_side,
+    no_screen,
+    proposed_screens,
+    too_small,
+    unreadable_orientation,
+)
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.reception import Reception, headerless, soft_bits
 from rxcli.receiver.search import search
@@ -33,6 +41,14 @@ __all__ = ["SKIPS", "CaeMode", "ReceiverOptions", "failed", "receive", "receive_
 _COUNTED_FROM_LEFT = (
     "no side of the screen is in view: columns are counted from the leftmost visible one; take one side into view to "
     "have the screen's numbers"
+)
+_UPSIDE_DOWN = (
+    "the rows run against the readout, as in a picture that was turned upside down or mirrored after it was taken; "
+    "columns count from the left of the stored picture"
+)
+_AS_STORED = (
+    "the file asks to be turned by 90 degrees, but the columns stand upright in the stored picture; they are counted "
+    "from its left"
 )
 
 
@@ -76,7 +92,7 @@ def receive_frame(frame: Frame, options: ReceiverOptions) -> FrameResult:
     """Receive one frame as a photograph."""
     timer = Timer()
     with one_blas_thread():
-        result = _receive_stated(frame, _in_total_order(options), timer)
+        result = _receive_either_way(frame, _in_total_order(options), timer)
     result = replace(result, message=_with_tried(result, options.screens), timing_ms=timer.total())
     if options.mirrored:
         return result.with_columns_mirrored()
@@ -90,6 +106,27 @@ def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str 
     return f"{result.message}; only the screen {screens[0].name} was tried (--screen auto tries all)"
 
 
+def _receive_either_way(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:
+    """Receive a frame as it is stored; without packets, also turned by 90 degrees if its columns lie along its rows."""
+    asks_for_turn = frame.metadata.orientation in turned.PORTRAIT
+    upright = turned.turned_frame(frame, 0) if asks_for_turn else frame
+    result = _receive_stated(upright, options, timer)
+    if _n_believable(result):
+        remark = _UPSIDE_DOWN if _is_reversed(result) else _AS_STORED if asks_for_turn else None
+        return _with_remark(result, remark)
+    if options.corners is not None or frame.mosaic is not None or not lies_on_its_side(upright, options, timer):
+        return result
+    attempts = []
+    for quarter_turns in turned.QUARTER_TURNS:
+        back = turned.turned_frame(frame, quarter_turns)
+        found = turned.as_stored(back, _receive_stated(back, options, timer), quarter_turns)
+        attempts.append((_n_believable(found) * (not _is_reversed(found)), _n_believable(found), quarter_turns, found))
+    _, n_packets, quarter_turns, found = max(attempts, key=lambda attempt: attempt[:3])
+    if n_packets:
+        return _with_remark(found, turned.remark(quarter_turns))
+    return failed(result, unreadable_orientation(frame) or Failure("no_screen", f"no screen found: {ON_ITS_SIDE}"))
+
+
 def _receive_stated(frame: Frame, options: ReceiverOptions, timer: Timer) -> FrameResult:
     """Receive a frame as profile and file state its camera; where few columns give packets, also as it is estimated."""
     best = stated = _receive_still(frame, options, timer)
@@ -97,11 +134,10 @@ def _receive_stated(frame: Frame, options: ReceiverOptions, timer: Timer) -> Fra
         if not _gives_few(best):
             break
         result = _receive_still(attempt, replace(estimating, dump_dir=None), timer)
-        if _n_believable(result) > _n_believable(best):
+        if _n_believable(result) > _n_believable(best) and is_credible(result, frame, options):
             best = result if options.dump_dir is None else _receive_still(attempt, estimating, timer)
             is_exposure = attempt.metadata.exposure_s != frame.metadata.exposure_s
-            message = difference(frame, options, stated, best, is_exposure=is_exposure)
-            best = replace(best, message=message if best.message is None else f"{message}; {best.message}")
+            best = _with_remark(best, difference(frame, options, stated, best, is_exposure=is_exposure))
     return best
 
 
@@ -109,6 +145,14 @@ def _gives_few(result: FrameResult) -> bool:
     """Whether less than half of the lit columns gave a packet."""
     lit = [column for column in result.columns if column.status != "dark"]
     return 2 * sum(column.status == "ok" for column in lit) < max(len(lit), 1)
+
+
+def _is_reversed(result: FrameResult) -> bool:
+    return result.estimated.get("readout_reversed", (0.0, 0.0))[0] > 0
+
+
+def _with_remark(result: FrameResult, remark: str | None) -> FrameResult:
+    return replace(result, message="; ".join(filter(None, (remark, result.message))) or None)
 
 
 def _n_believable(result: FrameResult) -> int:

@@ -12,7 +12,8 @@ def camera_of(frame: Frame, result: FrameResult, cameras: tuple[CameraProfile, .
     named = next((camera for camera in cameras if camera.name == result.camera_profile), None)
     if named is not None or "line_delay_s" not in result.estimated:
         return named
-    return camera_profile(result.estimated, "estimated", None, None, frame.width, frame.height)
+    size = (frame.height, frame.width) if result.quarter_turns else (frame.width, frame.height)
+    return camera_profile(result.estimated, "estimated", None, None, *size)
 
 
 def screen_of(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> ScreenProfile | None:

@@ -14,6 +14,7 @@ from rxcli.protocol import bits_per_symbol, encode_packet, hex_to_bits
 from rxcli.receiver import camera as blind
 from rxcli.receiver import plane
 from rxcli.receiver.decode import assemble
+from rxcli.receiver.turned import as_received
 from rxcli.results.overlay import outlines_of
 from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, RowProfiles
 
@@ -70,6 +71,7 @@ def inspect_frame(
         screen: the profile that it names.
         camera: the profile that it names, or the estimated one.
     """
+    frame, result = as_received(frame, result)
     if result.corners is None or not result.line_delay_s or not result.columns:
         return None
     width_px = float(np.linalg.norm(result.corners[1] - result.corners[0])) / screen.columns

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.turned import as_received, turned_points
 from rxcli.results.undistort import grey_levels
 from rxcli.types import FloatArray, Frame, FrameResult, Outlines
 
@@ -68,7 +69,9 @@ def column_polygons(
     """Number, status and outline (n, 2), in pixels of the frame, of every column; none where no screen was found."""
     if result.corners is None or screen is None or not result.columns:
         return []
-    outlines = outlines_of(result.corners, screen.columns, frame, camera)
+    frame, received = as_received(frame, result)
+    assert received.corners is not None
+    outlines = outlines_of(received.corners, screen.columns, frame, camera)
     found: list[tuple[int, str, FloatArray]] = []
     for column in result.columns:
         on_screen = np.flatnonzero(outlines.inside[column.column].any(axis=0))
@@ -78,7 +81,7 @@ def column_polygons(
         rows = outlines.rows[chosen].astype(np.float64)
         left, right = (outlines.edges_x[column.column + side, chosen].astype(np.float64) for side in (0, 1))
         sides = np.concatenate([np.column_stack([left, rows]), np.column_stack([right, rows])[::-1]])
-        found.append((column.column, column.status, sides))
+        found.append((column.column, column.status, turned_points(sides, frame, -result.quarter_turns % 4)))
     return found
 
 

@@ -22,7 +22,7 @@ _OBJECT = {"name": None, "size": None, "sha256": None, "share": 4, "n_blocks": N
 _PROGRESS = {"object_id": None, "container_bytes": None, "share": 4, "n_blocks": None, "blocks_done": None}
 _PROGRESS |= {"seconds_left": 2}
 #: Fields of a result that stand with its screen.
-_OF_SCREEN = ("inferred_sides", "column_certainty", "column_offset", "mirrored")
+_OF_SCREEN = ("inferred_sides", "column_certainty", "column_offset", "mirrored", "quarter_turns")
 
 
 def to_record(result: FrameResult) -> dict[str, Any]:
@@ -76,6 +76,7 @@ def _numbering(result: FrameResult) -> dict[str, Any]:
         **({"inferred_sides": list(result.inferred_sides)} if result.inferred_sides else {}),
         **({"column_certainty": certainty} if certainty != 1 else {}),
         **({"column_offset": None} if result.column_offset is None else {}),
+        **({"quarter_turns": result.quarter_turns} if result.quarter_turns else {}),
         **({"mirrored": result.mirrored} if result.mirrored is not False else {}),
     }
 

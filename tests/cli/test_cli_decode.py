@@ -20,6 +20,7 @@ from small_frames import N_COLUMNS, W, write_frame, write_profiles
 
 from rxcli.cli.main import run
 from rxcli.results.baseline import Baseline, Run
+from rxcli.results.record import from_record
 from rxcli.results.undistort import UndistortedWriter
 from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
 
@@ -210,7 +211,6 @@ def test_a_run_is_held_against_an_earlier_one(tmp_path: Path, decode: Decode) ->
         (lambda: np.full((600, 800), 255, np.uint8), "is saturated; expose shorter"),
         (lambda: np.zeros((60, 80), np.uint8), "use the picture in its full size"),
         (lambda: np.random.default_rng(1).integers(90, 99, (600, 800), np.uint8), "photograph a screen that sends"),
-        (lambda: np.rot90(cv2.imread(str(PHOTO), cv2.IMREAD_GRAYSCALE)), "was turned by 90 degrees"),
     ],
 )
 def test_advice_is_by_what_was_seen(make: Any, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -261,6 +261,17 @@ def test_a_frame_without_a_profile_waits_for_the_lens_that_is_estimated(
     edges = [np.ptp(np.argmax(picture > 125, axis=0)) for picture in (bent, cv2.imread(str(path), 0))]
     assert edges[0] >= 6
     assert edges[1] <= 1
+
+
+def test_a_photo_that_was_turned_is_received_and_the_json_says_how(tmp_path: Path) -> None:
+    picture, out, again = tmp_path / "a.png", tmp_path / "a.jsonl", tmp_path / "page"
+    cv2.imwrite(str(picture), np.rot90(cv2.imread(str(PHOTO), cv2.IMREAD_GRAYSCALE)))
+    screen = ["--screen", "paper-17k3"]
+    assert run(["decode", str(picture), *screen, "--json", str(out), "--save-camera", str(tmp_path / "a.toml")]) == 0
+    result = from_record(json.loads(out.read_text()))
+    assert (result.quarter_turns, len(result.packets)) == (3, 20)
+    assert 'name = "4032x3024"' in (tmp_path / "a.toml").read_text()
+    assert run(["inspect", str(picture), *screen, "--out", str(again)]) == 0
 
 
 def test_an_estimated_camera_is_kept_as_a_profile(tmp_path: Path) -> None:

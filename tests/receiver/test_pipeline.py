@@ -24,6 +24,7 @@ from rxcli.receiver.pipeline import ReceiverOptions, receive, receive_frame
 from rxcli.receiver.reception import headerless
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.still import initial_pass
+from rxcli.receiver.turned import as_received
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Clock, Frame, FrameResult, Metadata, Mosaic, PacketResult
 
@@ -113,9 +114,14 @@ def test_a_clean_frame_gives_every_packet(screen: str, camera: str) -> None:
     assert all(c.snr_db is not None and c.snr_db > 5 for c in result.columns)
 
 
-def test_the_screen_is_found_in_a_frame_of_true_proportions() -> None:
+@cache
+def proportioned() -> Capture:
     scene = replace(preset("xs10-still", "paper-8k65"), picture="sky", start_slot=20.0).scaled(0.25, keep_readout=True)
-    taken = simulate_frame(replace(scene, light_e_per_s=2 * scene.light_e_per_s), 1)
+    return simulate_frame(replace(scene, light_e_per_s=2 * scene.light_e_per_s), 1)
+
+
+def test_the_screen_is_found_in_a_frame_of_true_proportions() -> None:
+    taken = proportioned()
     result = received(frame_of(taken), options_for(taken, corners=None))
     score = score_of(result, taken)
     assert score.expected >= 20
@@ -302,15 +308,30 @@ def test_columns_with_delays(reach: float) -> None:
     assert np.quantile(np.abs(off - np.median(off)), 0.8) < 0.2
 
 
-def test_portrait_is_refused_with_a_reason() -> None:
+@pytest.mark.parametrize("orientation", [5, 6, 7, 8])
+def test_upright_columns_are_received_though_the_file_says_portrait(orientation: int) -> None:
     taken = clean()
-    for orientation in (5, 6, 7, 8):
-        result = received(frame_of(taken, orientation=orientation), options_for(taken))
-        assert result.status == "no_signal"
-        assert result.columns == ()
-        assert result.message is not None
-        assert "portrait" in result.message
-        assert "landscape" in result.message
+    result = received(frame_of(taken, orientation=orientation), options_for(taken))
+    assert score_of(result, taken).error_free == 20
+    assert "the columns stand upright in the stored picture" in str(result.message)
+
+
+@pytest.mark.parametrize(
+    ("quarter_turns", "note"), [(1, "turned back by 90 degrees clockwise"), (3, "degrees counter-"), (2, "upside down")]
+)
+def test_a_picture_that_was_turned_afterwards_is_received_turned_back(quarter_turns: int, note: str) -> None:
+    taken = proportioned()
+    frame = frame_of(taken, np.ascontiguousarray(np.rot90(taken.pixels, quarter_turns)))
+    result = received(frame, options_for(taken, corners=None))
+    assert note in str(result.message)
+    upside_down = quarter_turns == 2
+    assert score_of(result.with_columns_mirrored() if upside_down else result, taken).error_free >= 18
+    assert result.quarter_turns == (0 if upside_down else 4 - quarter_turns)
+    back, turned_back = as_received(frame, result)
+    assert turned_back.corners is not None
+    if not upside_down:
+        assert np.array_equal(back.pixels, taken.pixels)
+        assert np.abs(turned_back.corners - corners_of(taken)).max() < 8
 
 
 def test_a_screen_too_small_says_how_much_it_needs() -> None:

@@ -22,7 +22,10 @@ from rxcli.web.decoding import answer_for
 #: Kind of photo -> a part of the reason, and of the next step.
 PHOTOS = {
     "too dark": ("it is dark (5 % of white on average)", "expose longer, raise ISO, or show a brighter picture"),
-    "portrait": ("taken in portrait: its stripes run downwards", "use the camera's own file, taken in landscape"),
+    "portrait": (
+        "as in portrait or where a picture was turned after it was taken",
+        "use the camera's own file, taken in landscape",
+    ),
     "ordinary": ("no columns of a modulated backlight were found in the picture", "photograph a screen that sends"),
 }
 
