@@ -39,7 +39,7 @@ def scene(mode: str, picture: str) -> Scene:
         light_e_per_s=900 / EXPOSURE_S,
         room=replace(base.room, light_e_per_s=8 / EXPOSURE_S),
         blur_px=0.6,
-        lcd_grid=0.0,
+        panel=0.0,
         make="Example",
         model="Folder",
         camera_name="folder",

@@ -205,6 +205,15 @@ def test_groups_ways_and_packets_are_counted() -> None:
     assert "target" not in whole
 
 
+def test_packets_are_compared_with_those_of_the_first_row() -> None:
+    score = {"expected": 4, "error_free": 4}
+    records = [_record("none"), _record("none"), _record("effect")]
+    for record, right in zip(records, (4, 2, 1), strict=True):
+        record["ways"]["receiver"]["score"] = {**score, "error_free": right}
+    table = measures.rows(records, ["receiver"], ("n", "of_plain"))
+    assert [row["of_plain"] for row in table[:2]] == pytest.approx([1, 1 / 3])
+
+
 def test_stages_are_columns_as_ratios_to_the_bare_decode() -> None:
     records = [
         _record(wall_s=wall, stages_ms={"detect": 1e3 * wall, "total": 2e3 * wall})

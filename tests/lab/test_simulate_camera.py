@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +11,11 @@ from numpy.typing import NDArray
 
 from rxcli.lab.simulate.camera import render_band
 from rxcli.lab.simulate.capture import prepare, simulate_frame
-from rxcli.lab.simulate.isp import Isp, correction_map, develop, tone_curve
+from rxcli.lab.simulate.isp import Isp, correction_map, develop, local_gain, tone_curve
 from rxcli.lab.simulate.optics import Lens, Pose, View, distort, undistort
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.lab.simulate.sensor import Sensor, count_electrons, pick_colours, to_raw
-from rxcli.lab.simulate.shutter import flicker, lit_share, overlaps
+from rxcli.lab.simulate.shutter import flicker, lagging_share, lit_share, slot_shares
 from rxcli.lab.simulate.transmitter import light_spread
 from rxcli.profiles import ScreenProfile, load_profile
 
@@ -74,10 +75,26 @@ def test_lit_share_is_the_integral_over_the_exposure(length: float) -> None:
     shares = lit_share(slots, starts, length)
     np.testing.assert_allclose(shares, [brute_share(slots, s, length) for s in starts], atol=3e-5)
     inside = (starts >= 0) & (starts + length <= 35)
-    first, parts = overlaps(starts[inside], length)
+    parts = slot_shares(starts[inside], length, np.arange(40.0))
     np.testing.assert_allclose(parts.sum(axis=1), 1.0)
-    lit = (parts * slots[first[:, None] + np.arange(parts.shape[1])]).sum(axis=1)
-    np.testing.assert_allclose(lit, shares[inside], atol=1e-12)
+    np.testing.assert_allclose(parts @ slots, shares[inside], atol=1e-12)
+
+
+@pytest.mark.parametrize(("length", "decay"), [(0.5, 60.0), (4.3, 7.0), (1.0, 0.2)])
+def test_lagging_light_decays_exponentially(length: float, decay: float) -> None:
+    """Against Euler's method, and as the sum of what every slot adds."""
+    slots = np.random.default_rng(4).integers(0, 2, 60, dtype=np.uint8)
+    starts, fine = np.array([0.0, 0.7, 20.2, 54.9]), 2000
+    light = [0.0]
+    for step in range(60 * fine):
+        light.append(light[-1] + (slots[step // fine] - light[-1]) / (decay * fine))
+    begin, n = np.rint(starts * fine).astype(int), round(length * fine)
+    means = [np.mean(light[b : b + n]) for b in begin]
+    shares = lagging_share(slots, starts, length, decay, 0.0)
+    np.testing.assert_allclose(shares, means, atol=2e-3)
+    np.testing.assert_allclose(slot_shares(starts, length, np.arange(60.0), decay) @ slots, shares, atol=1e-9)
+    steady = lagging_share(np.ones(60, np.uint8), starts, length, decay, 1.0)
+    np.testing.assert_allclose(steady, 1.0)
 
 
 def test_flicker_is_averaged_over_the_exposure() -> None:
@@ -102,6 +119,34 @@ def test_noise_has_the_variance_of_its_parts(mean: float) -> None:
     assert rows == pytest.approx(0.25, rel=0.4)
 
 
+def test_red_that_lags_blinks_less_and_shines_as_long(small: Scene) -> None:
+    sensor = replace(small.sensor, cfa="rgb", colour_mixing=0.0)
+    scene = replace(small, picture="white", sensor=sensor, vignetting=0.0, red_lag_s=8e-3, start_slot=5000.0)
+    plain, lagging = (prepare(replace(scene, red_lag_share=share), 1).exposure() for share in (0.0, 0.9))
+    mean, lagged = (render_band(exposure, 256, 512).mean_e[:, 200:300].mean(axis=1) for exposure in (plain, lagging))
+    np.testing.assert_allclose(lagged[:, 1:], mean[:, 1:], rtol=1e-5)
+    assert lagged[:, 0].std() / lagged[:, 0].mean() < 0.2 * mean[:, 0].std() / mean[:, 0].mean()
+    assert lagged[:, 0].mean() == pytest.approx(mean[:, 0].mean(), rel=0.1)
+
+
+def test_glare_adds_a_share_of_the_whole_picture_at_the_same_instant(small: Scene) -> None:
+    sensor = replace(small.sensor, cfa="rgb")
+    scene = replace(small, picture="white", sensor=sensor, room=replace(small.room, light_e_per_s=0.0))
+    exposures = [prepare(replace(scene, glare=glare), 1).exposure() for glare in (0.0, 0.1)]
+    plain, glaring = (render_band(exposure, 0, sensor.height).mean_e for exposure in exposures)
+    added = glaring - plain
+    np.testing.assert_allclose(added, np.broadcast_to(added[:, :1], added.shape), atol=1e-3)
+    assert added.mean() == pytest.approx(0.1 * plain.mean(), rel=0.05)
+    assert np.corrcoef(added.mean(axis=(1, 2)), exposures[0].lit[0].mean(axis=1))[0, 1] > 0.95
+
+
+def test_rows_read_at_once_see_the_same_instant(small: Scene) -> None:
+    scene = replace(small, sensor=replace(small.sensor, rows_at_once=2))
+    (lit,) = prepare(scene, 1).exposure().lit
+    np.testing.assert_array_equal(lit[::2], lit[1::2])
+    np.testing.assert_array_equal(lit[::2], prepare(small, 1).exposure().lit[0][::2])
+
+
 def test_raw_numbers_keep_black_and_white_level() -> None:
     sensor = Sensor(full_scale_e=100.0, black_level=512, white_level=4095)
     raw = to_raw(np.array([[-1e6, 0.0, 50.0, 1e6]], np.float32), sensor)
@@ -120,15 +165,15 @@ def test_rendered_light_is_the_model_written_out(small: Scene) -> None:
     own = (light_spread(place[..., 1], 8, screen.light_spread) @ exposure.drive.lit_light) * light_spread(
         place[..., 0], screen.columns, screen.light_spread
     )
-    expected = (own * exposure.lit[y]).sum(axis=-1) * scene.light_e_per_s * scene.exposure_s
+    expected = (own * exposure.lit[0][y]).sum(axis=-1) * scene.light_e_per_s * scene.exposure_s
     inside = (np.abs(place - 0.5) < 0.5).all(axis=-1)
-    error = band.backlight[::7, ::3][inside] - expected[inside]
+    error = band.backlights[0][::7, ::3][inside] - expected[inside]
     assert np.abs(error).max() < 0.01 * expected[inside].max()
 
 
 def test_blur_keeps_the_pictures_light(small: Scene) -> None:
     sharp, soft = (
-        prepare(replace(small, picture="checker", blur_px=blur), 1).exposure().texture.sum() for blur in (0.3, 2.5)
+        prepare(replace(small, picture="checker", blur_px=blur), 1).exposure().textures[0].sum() for blur in (0.3, 2.5)
     )
     assert soft == pytest.approx(sharp, rel=1e-3)
 
@@ -156,8 +201,8 @@ def test_delays_move_columns_by_slots(small: Scene) -> None:
     scene = replace(small, start_slot=40.0)
     plain = prepare(scene, 1).exposure()
     late = prepare(replace(scene, column_delay_slots=(delay,) + (0.0,) * 19), 1).exposure()
-    np.testing.assert_allclose(late.lit[rows:, 0], plain.lit[:-rows, 0], atol=1e-9)
-    np.testing.assert_allclose(plain.lit[:, 1:], late.lit[:, 1:], atol=1e-9)
+    np.testing.assert_allclose(late.lit[0][rows:, 0], plain.lit[0][:-rows, 0], atol=1e-9)
+    np.testing.assert_allclose(plain.lit[0][:, 1:], late.lit[0][:, 1:], atol=1e-9)
 
 
 def test_electrons_over_the_picture_have_the_expected_mean(small: Scene) -> None:
@@ -200,3 +245,20 @@ def test_correction_in_the_camera_undoes_the_lens() -> None:
     ideal = view.pixels_to_ideal(places)
     matrix = view.camera_matrix
     np.testing.assert_allclose(ideal * matrix[[0, 1], [0, 1]] + matrix[:2, 2], [200, 100], atol=0.02)
+
+
+@pytest.mark.parametrize("tone", ["srgb", "bt709", "gamma", "linear", "filmic"])
+def test_tone_curves_rise_from_black_to_white(tone: Any) -> None:
+    curve = tone_curve(np.linspace(0, 1, 500, dtype=np.float32), tone)
+    assert (curve[0], curve[-1]) == pytest.approx((0, 1), abs=1e-5)
+    assert (np.diff(curve) > 0).all()
+
+
+def test_local_tone_mapping_raises_dark_places_and_keeps_their_stripes() -> None:
+    planes = np.full((300, 400, 3), 0.6, np.float32)
+    planes[:, 200:] = 0.03
+    planes[::10] *= 0.5
+    gain = local_gain(planes)
+    assert 0.5 < gain[150, 100, 0] < 1 < 2 < gain[150, 300, 0] <= 3
+    mapped = planes * gain
+    assert mapped[150, 300, 0] / mapped[151, 300, 0] == pytest.approx(0.5, rel=0.02)

@@ -49,12 +49,20 @@ def test_neighbours_give_fifteen_percent_in_the_middle_and_half_at_the_edge() ->
     assert share[1] == pytest.approx(0.5, abs=0.01)
 
 
+def test_tails_of_the_spread_are_those_measured() -> None:
+    places = (np.array([10, 11, 12]) + 0.5) / 20
+    light = light_spread(places, 20, 0.45, 0.39)[:, 10]
+    assert light[1:] / light[0] == pytest.approx([0.20, 0.03], abs=2e-3)
+    fine = (np.arange(-20000, 40000) + 0.5) / 20000
+    assert light_spread(fine, 20, 0.45, 0.39)[:, 10].mean() * 60 == pytest.approx(1.0, rel=1e-6)
+
+
 def test_compensated_picture_times_backlight_is_the_picture(screen: ScreenProfile) -> None:
     picture = np.full((screen.height_px, screen.width_px, 3), 128, np.uint8)
     picture[:, ::2] = 90
     drive = drive_screen(screen, picture, (2,) * 10 + (8,) * 10)
     np.testing.assert_allclose(drive.lit_light * drive.weights / 10, drive.levels)
-    shown = drive.transmittance * backlight_average(drive.levels, screen, *picture.shape[:2])[..., None]
+    shown = drive.transmittance * backlight_average(drive.levels, screen, *picture.shape[:2], 0.0)[..., None]
     wanted = (picture / 255) ** 2.2
     inner = (slice(100, -100), slice(80, -80))
     # The brightest pixels find a little less than the average light between segments, and cannot do more than open.

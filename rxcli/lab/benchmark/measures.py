@@ -40,6 +40,8 @@ class Group:
     reference: str
     #: Whose right packets `share` counts against.
     beside: str | None = None
+    #: Cases of the table's first row.
+    plain: Sequence[Record] = ()
 
     @cached_property
     def receptions(self) -> list[Record]:
@@ -125,6 +127,12 @@ def _ber_interval(group: Group) -> tuple[float, float]:
     return min(by_frame[0], by_packet[0]), max(by_frame[1], by_packet[1])
 
 
+def _of_plain(group: Group) -> float:
+    """Right packets of a case on average, over those of the table's first row."""
+    plain = Group(group.plain, group.way, group.reference).score.error_free / len(group.plain)
+    return group.score.error_free / len(group.cases) / max(plain, 1 / len(group.plain))
+
+
 def _real_time(group: Group) -> float | None:
     rates = [case["about"].get("frame_rate_hz") for case in group.cases]
     if None in rates:
@@ -158,6 +166,7 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "right": lambda g: g.score.error_free if g.scores else None,
     "share": lambda g: g.score.error_free / max(g.yardstick.score.error_free, 1) if g.beside else None,
     "share95": lambda g: wilson(g.score.error_free, max(g.yardstick.score.error_free, g.score.error_free)),
+    "of_plain": lambda g: _of_plain(g) if g.plain else None,
     "ber": lambda g: g.score.ber,
     "ber95": _ber_interval,
     "lost": lambda g: g.score.lost,
@@ -226,7 +235,7 @@ def rows(
     for name in [*names, "all"]:
         cases = [record for record in records if name == "all" or name in record["groups"]]
         for way in ways:
-            group = Group(cases, way, ways[0], beside)
+            group = Group(cases, way, ways[0], beside, [case for case in records if names[:1] == case["groups"][:1]])
             cells = {column: MEASURES[column](group) for column in columns}
             stages = cells.pop("stages", {})
             table.append({"scenes": name, "way": way} | cells | stages)

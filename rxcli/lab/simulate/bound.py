@@ -4,19 +4,19 @@ The genie knows outline, clock, picture, room light and the other slots of the s
 left of a row for column `c` is the share `m` of its exposure that the column was lit, seen by every pixel with known
 gain `a` and noise variance `v`: the log-likelihood is `Q m - P m^2 / 2`, with `P = sum a^2 / v` and
 `Q = sum a (e - b) / v` over the row's pixels. So two numbers per row and column hold all information of the sensor.
+Where a part of the red light lags, it has a share and a gain of its own: `m` and `Q` are pairs, `P` is a matrix.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.simulate.camera import Band, Exposure, column_light
+from rxcli.lab.simulate.camera import DECAY_TIMES, Band, Exposure, column_light
 from rxcli.lab.simulate.optics import Float32Array, FloatArray, grid_nodes
-from rxcli.lab.simulate.shutter import overlaps
+from rxcli.lab.simulate.shutter import slot_shares
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 
 
@@ -25,25 +25,25 @@ class Oracle:
     """Sufficient statistics of one frame's sensor values, and the truth that the genie knows."""
 
     exposure: Exposure
-    #: (height, columns) `P`: information on the lit share of each row's exposure.
+    #: (kinds, kinds, height, columns) `P`: information on the lit share of each row's exposure, by kind of light.
     information: FloatArray
-    #: (height, columns) `Q`: matched filter output, the column's own light not taken off.
-    matched: FloatArray
+    #: (kinds, height, columns) `Q` of the noise alone: all light taken off.
+    noise: FloatArray
 
-    def slot_statistics(self, column: int) -> tuple[int, FloatArray, Any]:
-        """Statistics of a column's slots instead of its rows.
+    def about_slots(self, column: int, start_slot: int) -> tuple[FloatArray, FloatArray]:
+        """What the sensor holds about the ten slots of a symbol that begins at slot `start_slot`.
 
         Returns:
-            Number of the first slot; (n,) matched filter of each slot; sparse (n, n) information that two slots share.
+            (10,) matched filter of the noise; (10, 10) information that two slots share.
         """
-        from scipy.sparse import csr_array, diags_array
-
-        start = self.exposure.row_start_slots - self.exposure.delays[column]
-        first_slot, share = overlaps(start, self.exposure.exposure_slots)
-        slots = first_slot[:, None] - first_slot[0] + np.arange(share.shape[1])
-        exposed = csr_array((share.ravel(), slots.ravel(), np.arange(0, share.size + 1, share.shape[1])))
-        shared = exposed.T @ diags_array(self.information[:, column]) @ exposed
-        return int(first_slot[0]), exposed.T @ self.matched[:, column], shared.tocsr()
+        exposure, slots = self.exposure, start_slot + np.arange(SLOTS_PER_SYMBOL, dtype=np.float64)
+        start = exposure.row_start_slots - exposure.delays[column]
+        end_slot = start_slot + SLOTS_PER_SYMBOL + DECAY_TIMES * exposure.decays[-1]
+        rows = slice(*np.searchsorted(start, [start_slot - exposure.exposure_slots, end_slot]))
+        shares = [slot_shares(start[rows], exposure.exposure_slots, slots, decay) for decay in exposure.decays]
+        noise, information = self.noise[:, rows, column], self.information[:, :, rows, column]
+        matched = np.einsum("irs,ir->s", shares, noise)
+        return matched, np.einsum("irs,ijr,jrt->st", shares, information, shares, optimize=True)
 
     def decide(self, column: int, burst: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
         """Decide the payload symbols of one packet, each with all other slots known.
@@ -51,40 +51,42 @@ class Oracle:
         Returns:
             (N,) decided codebook indices, (N,) sent ones, (N,) whether the symbol was observed at all.
         """
-        link = self.exposure.link
-        origin, matched, shared = self.slot_statistics(column)
-        sent = link.slots(origin, origin + matched.size)[column].astype(np.float64)
+        exposure, link = self.exposure, self.exposure.link
         words = codebook(int(link.weights[column])).astype(np.float64)
-        score = np.zeros((link.screen.payload_symbols, words.shape[0]))
-        information = np.zeros(score.shape[0])
-        copies = burst * link.burst_slots - origin + np.arange(link.screen.repeats) * link.screen.packet_slots
-        starts = copies[:, None] + PREAMBLE_SLOTS + np.arange(score.shape[0]) * SLOTS_PER_SYMBOL
-        for copy, symbol in np.argwhere((starts >= 0) & (starts + SLOTS_PER_SYMBOL <= matched.size)):
-            inside = slice(starts[copy, symbol], starts[copy, symbol] + SLOTS_PER_SYMBOL)
-            own = shared[inside, inside].toarray()
-            expected = shared[inside] @ sent - own @ sent[inside]
-            score[symbol] += words @ (matched[inside] - expected) - 0.5 * np.einsum("ki,ij,kj->k", words, own, words)
+        sent = link.packets(burst)[column, PREAMBLE_SLOTS:].reshape(-1, SLOTS_PER_SYMBOL).astype(np.float64)
+        score, information = np.zeros((len(sent), len(words))), np.zeros(len(sent))
+        begin, end = exposure.row_start_slots[[0, -1]] - exposure.delays[column]
+        copies = burst * link.burst_slots + np.arange(link.screen.repeats) * link.screen.packet_slots
+        starts = copies[:, None] + PREAMBLE_SLOTS + np.arange(len(sent)) * SLOTS_PER_SYMBOL
+        whole = (starts >= np.floor(begin)) & (starts + SLOTS_PER_SYMBOL <= np.ceil(end + exposure.exposure_slots))
+        for copy, symbol in np.argwhere(whole):
+            matched, own = self.about_slots(column, int(starts[copy, symbol]))
+            score[symbol] += words @ (matched + own @ sent[symbol]) - 0.5 * np.einsum("ki,ij,kj->k", words, own, words)
             information[symbol] += np.trace(own)
-        truth = link.packets(burst)[column, PREAMBLE_SLOTS:].reshape(-1, SLOTS_PER_SYMBOL)
-        sent_index = np.argmax(words @ truth.T, axis=0)
-        return np.argmax(score, axis=1), sent_index, information > 0
+        return np.argmax(score, axis=1), np.argmax(words @ sent.T, axis=0), information > 0
 
 
 class OracleRecorder:
     """Gathers an `Oracle` while bands are read out."""
 
     def __init__(self, exposure: Exposure) -> None:
-        shape = (exposure.scene.sensor.height, exposure.link.screen.columns)
+        shape = (len(exposure.decays), exposure.scene.sensor.height, exposure.link.screen.columns)
         self._exposure = exposure
-        self._information, self._noise = np.zeros(shape), np.zeros(shape)
+        self._information, self._noise = np.zeros((shape[0], *shape)), np.zeros(shape)
 
     def visit(self, band: Band, electrons: Float32Array) -> None:
         """Take in one band of expected and read electrons."""
         sensor, pitch = self._exposure.scene.sensor, self._exposure.grid_pitch
         mean = band.mean_e
         variance = mean + np.float32(sensor.read_noise_e**2) + (np.float32(sensor.prnu) * mean) ** 2
-        gain2 = _cells(band.picture**2 / variance, pitch)
-        gain_noise = _cells(band.picture * (electrons - mean) / variance, pitch)
+        noise = electrons - mean
+        if sensor.row_noise_e:
+            # Hundreds of pixels of other columns give away the noise that all pixels of a row share.
+            across = tuple(range(1, noise.ndim))
+            whole = (noise / variance).sum(across) / ((1 / variance).sum(across) + 1 / sensor.row_noise_e**2)
+            noise -= whole.reshape(-1, *(1,) * len(across))
+        gain_noise = np.stack([_cells(a * noise / variance, pitch) for a in band.pictures])
+        gain2 = np.stack([[_cells(a * b / variance, pitch) for b in band.pictures] for a in band.pictures])
         x = grid_nodes(sensor.width, pitch)[1:-1]
         step = self._exposure.grid_rows
         # The columns' light hardly changes over a cell of the grid: its value in the middle stands for all its rows.
@@ -93,13 +95,12 @@ class OracleRecorder:
         for number, own in enumerate(light):
             part = slice(number * step, min((number + 1) * step, mean.shape[0]))
             rows = slice(band.top + part.start, band.top + part.stop)
-            self._information[rows] = gain2[part] @ (own**2).T
-            self._noise[rows] = gain_noise[part] @ own.T
+            self._information[:, :, rows] = gain2[:, :, part] @ (own**2).T
+            self._noise[:, rows] = gain_noise[:, part] @ own.T
 
     def finish(self) -> Oracle:
         """The oracle of the frame that was visited."""
-        matched = self._noise + self._information * self._exposure.lit
-        return Oracle(self._exposure, self._information, matched)
+        return Oracle(self._exposure, self._information, self._noise)
 
 
 def _cells(values: NDArray[np.floating], pitch: int) -> FloatArray:

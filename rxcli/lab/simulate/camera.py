@@ -20,7 +20,7 @@ from rxcli.lab.simulate.motion import HandMotion, turned, turned_back
 from rxcli.lab.simulate.optics import CORNERS, Float32Array, FloatArray, View, between_nodes, grid_nodes, project
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.sensor import count_electrons, pick_colours, repeat_gains, to_raw
-from rxcli.lab.simulate.shutter import flicker, lit_share
+from rxcli.lab.simulate.shutter import flicker, lagging_share, lit_share
 from rxcli.lab.simulate.transmitter import Drive, Link, light_spread
 
 #: Pitch of the coarse grid in rows, and rows of one band of work (a multiple of it).
@@ -30,6 +30,8 @@ _BAND_ROWS = 256
 _TEXTURE_MARGIN = 12
 #: Rounds after which a place of the screen is on the row that is read when it is there.
 _MOTION_ROUNDS = 4
+#: Decay times after which light has gone, and points across the sensor at which the light that glares is sampled.
+DECAY_TIMES, _GLARE_POINTS = 8, 200
 #: Breadth of the dark frame around the panel, in screen widths.
 _BEZEL_WIDTHS = 0.035
 
@@ -57,8 +59,7 @@ class Exposure:
     @cached_property
     def row_start_slots(self) -> FloatArray:
         """(height,) slot of the common clock at which every row starts to integrate."""
-        rows = np.arange(self.scene.sensor.height, dtype=np.float64)
-        return np.asarray(self.start_slot + rows * (self.scene.sensor.line_delay_s * self.slot_rate_hz))
+        return np.asarray(self.start_slot + self.scene.sensor.row_times_s() * self.slot_rate_hz)
 
     def pixels_to_screen(self, pixels: FloatArray) -> FloatArray:
         """Screen places (u, v) of sensor places (..., 2), each row at the middle of its own exposure."""
@@ -92,23 +93,44 @@ class Exposure:
         """Exposure in slots."""
         return self.scene.exposure_s * self.slot_rate_hz
 
+    @property
+    def decays(self) -> tuple[float, ...]:
+        """Time to 1/e of each kind of light, slots: 0 of that which goes out at once, then of the red that lags."""
+        red = self.scene.red_lag_s * self.slot_rate_hz
+        return (0.0, red) if red else (0.0,)
+
     @cached_property
-    def lit(self) -> FloatArray:
-        """(height, columns) share of every row's exposure in which a column is lit."""
+    def lit(self) -> tuple[FloatArray, ...]:
+        """For each kind of light (height, columns) share of every row's exposure in which a column is lit."""
         starts = self.row_start_slots
-        first_slot = int(np.floor(starts[0] - self.delays.max())) - 1
+        first_slot = max(int(np.floor(starts[0] - self.delays.max() - DECAY_TIMES * self.decays[-1])), 0)
         last_slot = int(np.ceil(starts[-1] + self.exposure_slots - self.delays.min())) + 1
+        first_slot = min(first_slot, int(np.floor(starts[0] - self.delays.max())) - 1)
         slots = self.link.slots(first_slot, last_slot)
-        delayed = zip(slots, starts - self.delays[:, None] - first_slot, strict=True)
-        shares = [lit_share(column, start, self.exposure_slots) for column, start in delayed]
-        return np.stack(shares, axis=1)
+        delayed = list(zip(slots, starts - self.delays[:, None] - first_slot, self.link.weights / 10, strict=True))
+        shares = [[lit_share(column, start, self.exposure_slots) for column, start, _ in delayed]]
+        for decay in self.decays[1:]:
+            shares += [[lagging_share(column, start, self.exposure_slots, decay, w) for column, start, w in delayed]]
+        return tuple(np.stack(columns, axis=1) for columns in shares)
 
     @cached_property
     def room_rows(self) -> FloatArray:
         """(height,) electrons of a green pixel that sees white paper in the room's light."""
-        starts = self.start_s + np.arange(self.scene.sensor.height, dtype=np.float64) * self.scene.sensor.line_delay_s
+        starts = self.start_s + self.scene.sensor.row_times_s()
         wave = flicker(starts, self.scene.exposure_s, self.scene.room.flicker_hz, self.scene.room.flicker_depth, 0.0)
         return wave * (self.scene.room.light_e_per_s * self.scene.exposure_s)
+
+    @cached_property
+    def glare_rows(self) -> FloatArray:
+        """(height, 3) electrons of every colour that glare adds to a row: a share of the mean at that instant."""
+        sensor, step = self.scene.sensor, self.scene.sensor.width // _GLARE_POINTS + 1
+        x, y = (np.arange(0, size, step, dtype=np.float64) for size in (sensor.width, sensor.height))
+        places = _in_texture(self, x, y)
+        light, total = column_light(self, x, y), np.zeros((sensor.height, 3))
+        for texture, lit in zip(self.textures, self.lit, strict=True):
+            image = cv2.remap(texture, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+            total += lit @ np.einsum("ycx,yxk->ck", light, image) / image[..., 0].size
+        return np.asarray(total * self.scene.glare)
 
     @cached_property
     def grid_pitch(self) -> int:
@@ -126,16 +148,24 @@ class Exposure:
     def texture_scale(self) -> tuple[int, int]:
         """Texture pixels per panel pixel, down and across: three where its colour stripes can be resolved, else one."""
         magnification = self.view.pixels_per_width / self.drive.grey.shape[1]
-        return (3, 3) if self.scene.lcd_grid > 0 and magnification > 1.2 else (1, 1)
+        return (3, 3) if self.scene.panel > 0 and magnification > 1.2 else (1, 1)
 
     @cached_property
-    def texture(self) -> Float32Array:
-        """(h, w, 3) electrons of the sensor's colours per unit of green light, blurred, with a black margin."""
+    def textures(self) -> tuple[Float32Array, ...]:
+        """For each kind of light (h, w, 3) electrons of the sensor's colours per unit of green light, blurred.
+
+        There is a black margin around the panel.
+        """
+        lagging = self.scene.red_lag_share * (len(self.decays) > 1)
+        kinds = np.array([[1 - lagging, 1, 1], [lagging, 0, 0]])
+        return tuple(self._texture(colours) for colours in kinds[: len(self.decays)])
+
+    def _texture(self, colours: FloatArray) -> Float32Array:
         down, across = self.texture_scale
-        light = self.drive.transmittance
+        light = self.drive.transmittance * colours.astype(np.float32)
         fine = np.repeat(np.repeat(light, down, axis=0), across, axis=1)
         if across > 1:
-            _draw_pixel_structure(fine, self.scene.lcd_grid)
+            _draw_pixel_structure(fine, self.scene.panel)
         colours = cv2.transform(fine, self.scene.sensor.colour_matrix.astype(np.float32))
         margins = (_TEXTURE_MARGIN,) * 4
         colours = cv2.copyMakeBorder(colours, *margins, cv2.BORDER_CONSTANT, value=0)
@@ -171,8 +201,9 @@ def column_light(exposure: Exposure, x: FloatArray, y: FloatArray) -> Float32Arr
     pixels = np.stack(np.meshgrid(x, y), axis=-1)
     place = exposure.pixels_to_screen(pixels)
     gain = exposure.scene.light_e_per_s * exposure.scene.exposure_s * _vignette(exposure, pixels)
-    along = light_spread(place[..., 1], screen.segment_rows, screen.light_spread) @ exposure.drive.lit_light
-    along *= light_spread(place[..., 0], screen.columns, screen.light_spread)
+    widths = screen.light_spread, exposure.scene.spread_tails
+    along = light_spread(place[..., 1], screen.segment_rows, *widths) @ exposure.drive.lit_light
+    along *= light_spread(place[..., 0], screen.columns, *widths)
     along *= gain[..., None]
     return np.ascontiguousarray(along.transpose(0, 2, 1), np.float32)
 
@@ -188,18 +219,20 @@ class Band:
     """Expected light of some rows."""
 
     top: int
-    #: (rows, width[, 3]) picture as the sensor's colours see it, per unit of green light.
-    picture: Float32Array
-    #: (rows, width) electrons of green light from all columns.
-    backlight: Float32Array
-    #: (rows, width[, 3]) electrons of the room's light.
+    #: For each kind of light (rows, width[, 3]) picture as the sensor's colours see it, per unit of green light.
+    pictures: tuple[Float32Array, ...]
+    #: For each kind of light (rows, width) electrons of green light from all columns.
+    backlights: tuple[Float32Array, ...]
+    #: (rows, width[, 3]) electrons of the room's light and of glare.
     room: Float32Array
 
     @cached_property
     def mean_e(self) -> Float32Array:
         """(rows, width[, 3]) expected electrons."""
-        light = self.backlight if self.picture.ndim == 2 else self.backlight[..., None]
-        return np.asarray(self.picture * light + self.room)
+        mean = self.room.copy()
+        for picture, light in zip(self.pictures, self.backlights, strict=True):
+            mean += picture * (light if picture.ndim == 2 else light[..., None])
+        return mean
 
 
 def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
@@ -207,45 +240,55 @@ def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
     sensor, pitch = exposure.scene.sensor, exposure.grid_pitch
     places = _texture_places(exposure, top, bottom)
     flags: dict[str, int] = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_CONSTANT, "borderValue": 0}
-    picture = pick_colours(np.asarray(cv2.remap(exposure.texture, *places, **flags)), sensor.pattern, top)
-    nodes = _backlight_nodes(exposure, grid_nodes(sensor.width, pitch), top, bottom)
-    backlight = cv2.resize(nodes, (nodes.shape[1] * pitch, nodes.shape[0]), interpolation=cv2.INTER_LINEAR)
-    light = np.ascontiguousarray(backlight[:, pitch : pitch + sensor.width], np.float32)
-    return Band(top, picture, light, _room_light(exposure, top, bottom))
+    images = [np.asarray(cv2.remap(texture, *places, **flags)) for texture in exposure.textures]
+    pictures = tuple(pick_colours(picture, sensor.pattern, top) for picture in images)
+    backlights = []
+    for nodes in _backlight_nodes(exposure, grid_nodes(sensor.width, pitch), top, bottom):
+        light = cv2.resize(nodes, (nodes.shape[1] * pitch, nodes.shape[0]), interpolation=cv2.INTER_LINEAR)
+        backlights.append(np.ascontiguousarray(light[:, pitch : pitch + sensor.width], np.float32))
+    return Band(top, pictures, tuple(backlights), _other_light(exposure, top, bottom))
 
 
 def _texture_places(exposure: Exposure, top: int, bottom: int) -> tuple[Float32Array, Float32Array]:
     """The place (x, y) of every pixel in the texture, interpolated between nodes."""
     pitch = 16
     x, y = grid_nodes(exposure.scene.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
+    inner = between_nodes(_in_texture(exposure, x, y), pitch, bottom - top, exposure.scene.sensor.width)
+    return np.ascontiguousarray(inner[..., 0]), np.ascontiguousarray(inner[..., 1])
+
+
+def _in_texture(exposure: Exposure, x: FloatArray, y: FloatArray) -> Float32Array:
+    """(ny, nx, 2) places in the texture of sensor columns (nx,) and rows (ny,)."""
     place = exposure.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
     down, across = exposure.texture_scale
     panel_height, panel_width = exposure.drive.grey.shape[:2]
     scale = np.array([panel_width * across, panel_height * down])
-    nodes = np.clip(place * scale - 0.5 + _TEXTURE_MARGIN, -1e4, 1e5).astype(np.float32)
-    inner = between_nodes(nodes, pitch, bottom - top, exposure.scene.sensor.width)
-    return np.ascontiguousarray(inner[..., 0]), np.ascontiguousarray(inner[..., 1])
+    return np.asarray(np.clip(place * scale - 0.5 + _TEXTURE_MARGIN, -1e4, 1e5), np.float32)
 
 
-def _backlight_nodes(exposure: Exposure, x: FloatArray, top: int, bottom: int) -> Float32Array:
-    """(rows, nodes) electrons of green light: the columns' light, interpolated along rows, times lit shares."""
+def _backlight_nodes(exposure: Exposure, x: FloatArray, top: int, bottom: int) -> list[Float32Array]:
+    """For each kind of light (rows, nodes) electrons: the columns' light, interpolated along rows, times lit shares."""
     pitch = exposure.grid_rows
     n_cells = -(-(bottom - top) // pitch)
     light = column_light(exposure, x, top + pitch * np.arange(n_cells + 1.0))
-    padded = np.zeros((n_cells * pitch, exposure.lit.shape[1]), np.float32)
-    padded[: bottom - top] = exposure.lit[top:bottom]
-    lit = padded.reshape(n_cells, pitch, -1)
-    share = (np.arange(pitch, dtype=np.float32) / pitch)[None, :, None]
-    ends = np.concatenate([lit * (1 - share), lit * share], axis=2)
     pairs = np.concatenate([light[:-1], light[1:]], axis=1)
-    nodes: Float32Array = np.matmul(ends, pairs).reshape(n_cells * pitch, -1)
-    return nodes[: bottom - top]
+    share = (np.arange(pitch, dtype=np.float32) / pitch)[None, :, None]
+    found = []
+    for shares in exposure.lit:
+        padded = np.zeros((n_cells * pitch, shares.shape[1]), np.float32)
+        padded[: bottom - top] = shares[top:bottom]
+        lit = padded.reshape(n_cells, pitch, -1)
+        ends = np.concatenate([lit * (1 - share), lit * share], axis=2)
+        found.append(np.matmul(ends, pairs).reshape(n_cells * pitch, -1)[: bottom - top])
+    return found
 
 
-def _room_light(exposure: Exposure, top: int, bottom: int) -> Float32Array:
-    """Electrons of the room's light, from walls, bezel, panel and a mirrored lamp."""
+def _other_light(exposure: Exposure, top: int, bottom: int) -> Float32Array:
+    """Electrons of the room's light, from walls, bezel, panel and a mirrored lamp, and of glare."""
     light = _room_share(exposure, top, bottom) * exposure.room_rows[top:bottom, None].astype(np.float32)
     colours = light[..., None] * np.array(exposure.scene.sensor.response, np.float32)
+    if exposure.scene.glare:
+        colours += exposure.glare_rows[top:bottom, None].astype(np.float32)
     return pick_colours(colours, exposure.scene.sensor.pattern, top)
 
 
@@ -287,7 +330,8 @@ def take_picture(
     raw = np.empty(shape, np.uint16)
     gains = sensor.pixel_gains()
     # Shared by all bands: made once, before threads ask for them.
-    _ = exposure.texture, exposure.lit, exposure.room_rows, exposure.grid_pitch, exposure.grid_rows
+    _ = exposure.textures, exposure.lit, exposure.room_rows, exposure.grid_pitch, exposure.grid_rows
+    _ = exposure.glare_rows if exposure.scene.glare else None
 
     def work(rows: tuple[int, int]) -> None:
         band = render_band(exposure, *rows)

@@ -158,15 +158,15 @@ def prepare(scene: Scene, rng: np.random.Generator | int) -> Recording:
 
 def _drive(scene: Scene) -> Drive:
     if not isinstance(scene.picture, str):
-        return drive_screen(scene.screen, scene.picture, scene.w, scene.dimming)
+        return drive_screen(scene.screen, scene.picture, scene.w, scene.dimming, scene.spread_tails)
     drive = _drive_named if scene.picture in picture_names() else _drive_named.__wrapped__
-    return drive(scene.screen, scene.picture, scene.w, scene.dimming)
+    return drive(scene.screen, scene.picture, scene.w, scene.dimming, scene.spread_tails)
 
 
 @lru_cache(maxsize=8)
-def _drive_named(screen: ScreenProfile, name: str, weights: Weights, dimming: Dimming) -> Drive:
+def _drive_named(screen: ScreenProfile, name: str, weights: Weights, dimming: Dimming, tails: float) -> Drive:
     """Kept for sweeps, which show the same few pictures over and over."""
-    return drive_screen(screen, load_picture(name, screen.width_px, screen.height_px), weights, dimming)
+    return drive_screen(screen, load_picture(name, screen.width_px, screen.height_px), weights, dimming, tails)
 
 
 def _delays(scene: Scene, rng: np.random.Generator) -> FloatArray:

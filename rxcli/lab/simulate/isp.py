@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rxcli.lab.simulate.optics import Float32Array, View, between_nodes, grid_nodes
 from rxcli.lab.simulate.sensor import PATTERNS, Sensor
 
-Tone = Literal["srgb", "bt709", "gamma", "linear"]
+Tone = Literal["srgb", "bt709", "gamma", "linear", "filmic", "local"]
 Subsampling = Literal["444", "422", "420"]
 
 #: Weights of red, green and blue in luma (BT.601).
@@ -29,6 +29,12 @@ _TONES = {
     "bt709": (0.45, 1.099, 0.018, 4.5),
     "gamma": (1 / 2.2, 1.0, 0.0, 0.0),
 }
+_TONES |= {"filmic": _TONES["srgb"], "local": _TONES["srgb"]}
+#: Local tone mapping: how strongly places are brought to a common brightness, which one, up to what gain, and how far a
+#: place reaches, in picture widths.
+_EVENNESS, _BRIGHTNESS, _MAX_GAIN, _REACH_WIDTHS = 0.4, 0.35, 3.0, 0.04
+#: Where a filmic curve (x (a x + b) / (x (c x + d) + e), Narkowicz 2016) has the picture's white.
+_FILMIC_WHITE = 1.6
 #: Rows of a band of work and of its overlap: multiples of the mosaics' unit cells, for a common phase.
 _BAND_ROWS, _HALO_ROWS = 384, 12
 
@@ -57,12 +63,28 @@ def tone_curve(light: Float32Array, tone: Tone) -> Float32Array:
     x: Float32Array = np.clip(light, np.float32(0), np.float32(1))
     if tone == "linear":
         return x
+    if tone == "filmic":
+        x = _film(x * np.float32(_FILMIC_WHITE)) / _film(np.float32(_FILMIC_WHITE))
     exponent, gain, toe, slope = _TONES[tone]
     curve = np.asarray(cv2.pow(np.atleast_2d(x), exponent), np.float32).reshape(x.shape)
     curve *= np.float32(gain)
     curve -= np.float32(gain - 1)
     np.copyto(curve, x * np.float32(slope), where=x < np.float32(toe))
     return curve
+
+
+def _film(x: Any) -> Any:
+    return x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14)
+
+
+def local_gain(planes: Float32Array) -> Float32Array:
+    """(height, width, 1) gain of every place of a picture (height, width, 3): the darker, the more."""
+    small = cv2.resize(
+        luma(planes), (128, max(round(128 * planes.shape[0] / planes.shape[1]), 1)), interpolation=cv2.INTER_AREA
+    )
+    around = cv2.GaussianBlur(np.maximum(small, 1e-3), (0, 0), 128 * _REACH_WIDTHS)
+    gain = np.minimum((_BRIGHTNESS / around) ** _EVENNESS, _MAX_GAIN)
+    return np.asarray(cv2.resize(gain, planes.shape[1::-1], interpolation=cv2.INTER_LINEAR)[..., None], np.float32)
 
 
 def demosaic(raw: NDArray[np.uint16], sensor: Sensor) -> Float32Array:
@@ -113,6 +135,8 @@ def develop(raw: NDArray[np.uint16], sensor: Sensor, isp: Isp, view: View, bits:
     _in_bands(raw, lambda part: _panel_light(part, sensor, isp), planes)
     if isp.correct_distortion:
         planes = correct_distortion(planes, view)
+    if isp.tone == "local":
+        planes *= local_gain(planes)
     picture = np.empty(planes.shape, np.uint8 if bits == 8 else np.uint16)
     _in_bands(planes, lambda part: _finish(part, isp, bits), picture)
     return picture

@@ -81,7 +81,16 @@ class Scene:
     light_e_per_s: float = 0.95e6
     #: Standard deviation of the focus blur, pixels.
     blur_px: float = 1.0
-    lcd_grid: float = 0.5
+    #: Depth of the panel's pixel structure; 1: colours side by side, black between the rows of pixels.
+    panel: float = 0.5
+    #: Time to 1/e of the share of the red light that lags, as phosphors do; 0 for red that blinks as the others.
+    red_lag_s: float = 0.0
+    red_lag_share: float = 0.9
+    #: Share of a segment's light that spreads beyond the Gaussian of the screen's profile: 0.39 for 20 % of the light one
+    #: segment away and 3 % two away.
+    spread_tails: float = 0.0
+    #: Share of the whole picture's light that lens and filters scatter evenly over every row.
+    glare: float = 0.0
     vignetting: float = 0.15
     #: Slot at which row 0 of the first frame starts; None: anywhere in burst 0.
     start_slot: float | None = None

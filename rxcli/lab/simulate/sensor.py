@@ -45,8 +45,15 @@ class Sensor:
     full_scale_e: float = 130.0
     black_level: int = 1022
     white_level: int = 16383
+    #: Rows that are read at the same time.
+    rows_at_once: int = 1
     #: Height of a pixel over its width; other than 1 where a scene was scaled unevenly.
     pixel_aspect: float = 1.0
+
+    def row_times_s(self) -> NDArray[np.float64]:
+        """(height,) time from the exposure start of row 0 to that of every row."""
+        rows = np.arange(self.height)
+        return np.asarray((rows - rows % self.rows_at_once) * self.line_delay_s, np.float64)
 
     @property
     def raw_per_e(self) -> float:

@@ -27,22 +27,47 @@ def lit_share(slots: NDArray[np.uint8], start: FloatArray, length: float) -> Flo
     return np.asarray(np.clip(lit / length, 0.0, 1.0))
 
 
-def overlaps(start: FloatArray, length: float) -> tuple[NDArray[np.int64], FloatArray]:
-    """Which slots every exposure touches, and for what share of it.
+def lagging_share(slots: NDArray[np.uint8], start: FloatArray, length: float, decay: float, level: float) -> FloatArray:
+    """Mean over exposures of a light that follows a slot sequence exponentially, as a phosphor does.
+
+    The light `y` obeys `decay * y' = slot - y`; so its integral is that of the slots less `decay` times its growth.
+
+    Args:
+        slots: (n,) 0/1, slot `k` lasting from k to k + 1.
+        start: (rows,) exposure starts, in slots, 0 or more.
+        length: of every exposure, in slots.
+        decay: time to 1/e, in slots.
+        level: light at the start of slot 0.
+    """
+    light = np.empty(slots.size + 1)
+    light[0], keep = level, np.exp(-1 / decay)
+    for slot, lit in enumerate(slots.tolist()):
+        light[slot + 1] = lit + (light[slot] - lit) * keep
+
+    def light_at(time: FloatArray) -> FloatArray:
+        slot = np.minimum(time.astype(np.int64), slots.size - 1)
+        return np.asarray(slots[slot] + (light[slot] - slots[slot]) * np.exp((slot - time) / decay))
+
+    return lit_share(slots, start, length) - decay / length * (light_at(start + length) - light_at(start))
+
+
+def slot_shares(start: FloatArray, length: float, slots: FloatArray, decay: float = 0.0) -> FloatArray:
+    """(rows, n) what one lit slot adds to the mean of every exposure, at once or decaying; see `lagging_share`.
 
     Args:
         start: (rows,) exposure starts, in slots.
         length: of every exposure, in slots.
-
-    Returns:
-        (rows,) number of the first slot touched, and (rows, taps) share of the exposure in that slot and those after.
+        slots: (n,) numbers of the slots.
+        decay: time to 1/e, in slots; 0 for light that goes out at once.
     """
-    first_slot = np.floor(start).astype(np.int64)
-    taps = int(np.ceil(length)) + 1
-    left = first_slot[:, None] + np.arange(taps)
-    begin = np.maximum(left, start[:, None])
-    end = np.minimum(left + 1, start[:, None] + length)
-    return first_slot, np.maximum(end - begin, 0.0) / length
+
+    def since(time: FloatArray) -> FloatArray:
+        ramp = np.maximum(time, 0)
+        return ramp + decay * np.expm1(-ramp / decay) if decay else ramp
+
+    begin = start[:, None] - slots
+    light = [since(time) - since(time - 1) for time in (begin + length, begin)]
+    return np.asarray((light[0] - light[1]) / length)
 
 
 def flicker(start_s: FloatArray, exposure_s: float, frequency_hz: float, depth: float, phase: float) -> FloatArray:

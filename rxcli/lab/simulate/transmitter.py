@@ -36,7 +36,11 @@ Waveform = Callable[[FloatArray], FloatArray]
 Dimming = Literal["max", "none"]
 
 
-def light_spread(positions: FloatArray, n_segments: int, sigma: float) -> FloatArray:
+#: Standard deviation of the wide part of the light spread, segment pitches.
+_TAIL_SIGMA = 1.0
+
+
+def light_spread(positions: FloatArray, n_segments: int, sigma: float, tails: float = 0.0) -> FloatArray:
     """Light that unit segments throw on places along one axis of the screen.
 
     A segment's light integrates to one segment pitch, so equal drive gives a mean of one far from the edges.
@@ -45,10 +49,14 @@ def light_spread(positions: FloatArray, n_segments: int, sigma: float) -> FloatA
         positions: (n,) places in 0..1 across the screen; the spread goes on outside.
         n_segments: segments along the axis.
         sigma: of the Gaussian, in segment pitches; 0 for a sharp segment.
+        tails: share of the light in a second, wide Gaussian.
 
     Returns:
         (n, n_segments) float64.
     """
+    if tails:
+        near, wide = (light_spread(positions, n_segments, s) for s in (sigma, _TAIL_SIGMA))
+        return np.asarray((1 - tails) * near + tails * wide)
     offset = np.asarray(positions)[..., None] * n_segments - (np.arange(n_segments) + 0.5)
     if sigma == 0:
         return np.asarray((offset >= -0.5) & (offset < 0.5), np.float64)
@@ -119,7 +127,11 @@ def choose_weights(weights: Weights, levels: FloatArray) -> NDArray[np.int64]:
 
 
 def drive_screen(
-    screen: ScreenProfile, picture: NDArray[np.uint8], weights: Weights, dimming: Dimming = "max"
+    screen: ScreenProfile,
+    picture: NDArray[np.uint8],
+    weights: Weights,
+    dimming: Dimming = "max",
+    spread_tails: float = 0.0,
 ) -> Drive:
     """Local dimming, weights and compensated grey levels for a picture.
 
@@ -128,20 +140,21 @@ def drive_screen(
         picture: (height_px, width_px, 3) uint8 grey levels as they should appear.
         weights: see `choose_weights`.
         dimming: "max", or "none" for a backlight that is fully on everywhere.
+        spread_tails: see `Scene`.
     """
     shape = (screen.segment_rows, screen.columns)
     # The brightest grey level is the brightest light: the picture itself can be searched.
     levels = _PANEL_LIGHT[dimming_levels(picture, *shape)] if dimming == "max" else np.ones(shape)
-    backlight = backlight_average(levels, screen, picture.shape[0], picture.shape[1])
+    backlight = backlight_average(levels, screen, picture.shape[0], picture.shape[1], spread_tails)
     needed = _PANEL_LIGHT.astype(np.float32)[picture] / np.maximum(backlight, 1e-6)[..., None].astype(np.float32)
     grey = np.rint(255 * np.clip(needed, 0, 1) ** np.float32(1 / PANEL_GAMMA)).astype(np.uint8)
     return Drive(screen, grey, levels, choose_weights(weights, levels))
 
 
-def backlight_average(levels: FloatArray, screen: ScreenProfile, height: int, width: int) -> FloatArray:
+def backlight_average(levels: FloatArray, screen: ScreenProfile, height: int, width: int, tails: float) -> FloatArray:
     """(height, width) average light behind every pixel of the panel."""
-    across = light_spread((np.arange(width) + 0.5) / width, screen.columns, screen.light_spread)
-    along = light_spread((np.arange(height) + 0.5) / height, screen.segment_rows, screen.light_spread)
+    across = light_spread((np.arange(width) + 0.5) / width, screen.columns, screen.light_spread, tails)
+    along = light_spread((np.arange(height) + 0.5) / height, screen.segment_rows, screen.light_spread, tails)
     return np.asarray(along @ levels @ across.T)
 
 
