@@ -86,8 +86,8 @@ class Scene:
     #: Time to 1/e of the share of the red light that lags, as phosphors do; 0 for red that blinks as the others.
     red_lag_s: float = 0.0
     red_lag_share: float = 0.9
-    #: Share of a segment's light that spreads beyond the Gaussian of the screen's profile: 0.39 for 20 % of the light one
-    #: segment away and 3 % two away.
+    #: Share of a segment's light that spreads beyond the Gaussian of the screen's profile: 0.39 for 20 % of the light
+    #: one segment away and 3 % two away.
     spread_tails: float = 0.0
     #: Share of the whole picture's light that lens and filters scatter evenly over every row.
     glare: float = 0.0
