@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     ("--port", click.IntRange(0, 65535), 8017, "0 takes any free one."),
     ("--keep", FOLDER, None, "Keep uploads in this folder."),
     ("--max-upload", click.IntRange(1, 4096), 96, "Megabytes a file."),
+    ("--max-kept", click.IntRange(1, 1 << 20), 4096, "Megabytes of the folder of --keep."),
     ("--exposure", Exposure(), None, "Of the live camera: seconds, or 1/8000. [default: the shortest]"),
     ("--gain", int, None, "Of the live camera, in its own units. [default: as it is]"),
 )
@@ -66,7 +67,7 @@ def _site(device: Path | None, options: dict[str, Any]) -> Site:
         device=device,
         camera=CameraSettings(exposure_s=options["exposure"], gain=options["gain"], wait=True),
         keep=options["keep"],
-        bounds=Bounds(upload_bytes=options["max_upload"] << 20),
+        bounds=Bounds(upload_bytes=options["max_upload"] << 20, keep_bytes=options["max_kept"] << 20),
     )
 
 

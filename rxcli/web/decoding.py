@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import resource
-import shutil
 import signal
 import time
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -40,8 +42,10 @@ MAX_PIXELS = 64_000_000
 #: Maximum processor time of a clip; then the results so far are shown.
 _CLIP_S = 12.0
 _MAX_PACKETS = 2000
-#: Minimum interval between partial results of a clip.
+#: Time to the first partial result of a clip; each further one takes twice as long, for each repeats the one before.
 _PARTIAL_S = 0.4
+#: Maximum length of an answer, and of all partial ones of a clip together.
+_MAX_ANSWER_BYTES = 8 << 20
 _POLL_S = 0.05
 #: Number of latest pages whose photos are combined, and the memory for incomplete files of each.
 _SESSIONS, _SESSION_MB = 8, 32
@@ -66,19 +70,17 @@ class DecodingProcess:
     Args:
         options: of the receiver.
         limits: beyond which it is ended and replaced.
-        folder: of uploads, which the process removes if the server is killed, or None.
     """
 
-    def __init__(self, options: ReceiverOptions, limits: Limits | None = None, folder: Path | None = None) -> None:
+    def __init__(self, options: ReceiverOptions, limits: Limits | None = None) -> None:
         self._options = options
-        self._folder = folder
         self._limits = limits or Limits()
         self._process: BaseProcess | None = None
         self._connection: Connection | None = None
 
     def start(self) -> None:
         """Start the process before it is needed, so that the first picture need not wait for it."""
-        self._process, self._connection = start_process(_work, self._options, self._folder)
+        self._process, self._connection = start_process(_work, self._options)
 
     def close(self) -> None:
         """End the process; may be called again."""
@@ -114,7 +116,7 @@ class DecodingProcess:
             return self._answer(publish)
         except _EndedError as ended:
             reason, step = ended.args
-        except (EOFError, OSError):
+        except (EOFError, OSError, ValueError):
             reason, step = "reading it ended the program that reads pictures", "try another picture"
         log.warning("%s: %s", name, reason)
         self.close()
@@ -122,18 +124,38 @@ class DecodingProcess:
 
     def _answer(self, publish: Callable[[dict[str, Any]], None] | None) -> dict[str, Any]:
         assert self._connection is not None
-        end_s = time.monotonic() + self._limits.time_s
+        end_s, n_partial_bytes = time.monotonic() + self._limits.time_s, 0
         while True:
             while not self._connection.poll(_POLL_S):
                 if time.monotonic() > end_s:
                     raise _EndedError(f"it took more than {self._limits.time_s:.0f} s", "try a smaller picture")
                 if resident_bytes(self.pid) > self._limits.resident_bytes:
                     raise _EndedError("it takes too much memory", "try a smaller picture")
-            answer: dict[str, Any] = self._connection.recv()
+            answer, n_bytes = receive(self._connection)
             if not answer.get("partial"):
                 return answer
-            if publish is not None:
+            n_partial_bytes += n_bytes
+            if publish is not None and n_partial_bytes <= _MAX_ANSWER_BYTES:
                 publish(answer)
+
+
+def send(connection: Connection, answer: dict[str, Any]) -> None:
+    """Send an answer as JSON: pickles of a process that a hostile picture has taken over could run programs."""
+    connection.send_bytes(json.dumps(answer).encode())
+
+
+def receive(connection: Connection) -> tuple[dict[str, Any], int]:
+    """The next answer and its length in bytes.
+
+    Raises:
+        EOFError, OSError: the other end is closed, or the answer is too long.
+        ValueError: it is no answer.
+    """
+    data = connection.recv_bytes(_MAX_ANSWER_BYTES)
+    answer = json.loads(data)
+    if not isinstance(answer, dict):
+        raise ValueError("no answer")
+    return answer, len(data)
 
 
 class _EndedError(Exception):
@@ -150,21 +172,18 @@ def refusal(reason: str, step: str) -> dict[str, Any]:
     }
 
 
-def _work(connection: Connection, options: ReceiverOptions, folder: Path | None) -> None:
+def _work(connection: Connection, options: ReceiverOptions) -> None:
     """Main loop of the process: receive a file, send its answer, until the other end is closed."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # the server decides what they mean
         signal.signal(number, signal.SIG_IGN)
     _confine()
     _warm_up(options)
     sessions: OrderedDict[str, PhotoCollector] = OrderedDict()
-    try:
+    with suppress(EOFError, OSError):
         while True:
             path, name, session = connection.recv()
             photos = _photos_of(session, sessions, options)
-            connection.send(answer_for(Path(path), name, options, connection.send, photos))
-    except (EOFError, OSError):
-        if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
+            send(connection, answer_for(Path(path), name, options, partial(send, connection), photos))
 
 
 def _photos_of(
@@ -217,14 +236,14 @@ def answer_for(
         _check_pixels(path)
     except InputError as error:
         return refusal(error.message, error.hint)
-    gathered, published_s = _Gathered(options, time.process_time() + _CLIP_S), started_s
+    gathered, wait_s, published_s = _Gathered(options, time.process_time() + _CLIP_S), _PARTIAL_S, started_s
     decoder = standard_decoder(options, gathered.tap)
     try:
         for result in decoder.results(Source(name, str(path))):
             gathered.add(_without(photos.add(result) if photos else result, path))
-            if publish is not None and gathered.has_news and time.monotonic() - published_s > _PARTIAL_S:
+            if publish is not None and gathered.has_news and time.monotonic() - published_s > wait_s:
                 publish(gathered.answer() | {"name": name, "partial": True})
-                published_s = time.monotonic()
+                wait_s, published_s = 2 * wait_s, time.monotonic()
         answer = gathered.answer()
     except MemoryError:
         return refusal("it takes too much memory", "try a smaller picture")

@@ -22,7 +22,7 @@ from rxcli.results.columns import packet_rows, text_rows
 from rxcli.runs.batch import Source, standard_decoder, use_one_thread
 from rxcli.runs.processes import start_process
 from rxcli.types import FrameResult
-from rxcli.web.decoding import Previews
+from rxcli.web.decoding import Previews, receive, send
 
 log = logging.getLogger(__name__)
 
@@ -69,8 +69,8 @@ class LiveCamera(threading.Thread):
             self._process, ours = start_process(_work, *self._arguments)
             try:
                 while True:
-                    self._publish(ours.recv())
-            except (EOFError, OSError):
+                    self._publish(receive(ours)[0])
+            except (EOFError, OSError, ValueError):
                 ours.close()
             self._process.join()
             if self._running:
@@ -83,12 +83,12 @@ def _work(connection: Connection, device: Path, settings: CameraSettings, option
     """Main loop of the process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     use_one_thread()
-    source = LiveSource(device, settings, on_lost=lambda reason: connection.send({"problem": sentence(reason)}))
+    source = LiveSource(device, settings, on_lost=lambda reason: send(connection, {"problem": sentence(reason)}))
     try:
         for event in live_events(source, options):
-            connection.send(event)
+            send(connection, event)
     except ReceiverError as error:
-        connection.send({"problem": sentence(str(error))})
+        send(connection, {"problem": sentence(str(error))})
         time.sleep(_RESTART_S)
     except (BrokenPipeError, EOFError):
         return

@@ -12,9 +12,9 @@ import hmac
 import itertools
 import json
 import logging
+import os
 import shutil
 import socket
-import tempfile
 import time
 import uuid
 from collections import deque
@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import NamedTemporaryFile, TemporaryFile
 from typing import Any
 
 from aiohttp import web
@@ -50,6 +51,8 @@ _HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",  # the address may hold the token
     "Cache-Control": "no-store",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
 }
 #: A line of JSON for each answer: partial answers, then the complete one.
 _LINES = "application/x-ndjson"
@@ -57,6 +60,8 @@ _LINES = "application/x-ndjson"
 _SESSION, _SESSION_CHARACTERS = "X-Session", 64
 _LOCAL = ("127.0.0.1", "localhost", "::1", "[::1]")
 _CHUNK = 1 << 16
+#: Where the process that decodes opens a file of this one that has no name.
+_OPEN_FILES = Path(f"/proc/{os.getpid()}/fd")
 #: Receives the answers of a picture or the events of a camera, one after the other.
 _Publish = Callable[[dict[str, Any]], None]
 _SWEEP_S = 2.0
@@ -72,9 +77,11 @@ class Bounds:
     grace_s: float = 5.0
     #: Minimum rate of an upload, bytes a second.
     upload_rate: int = 32 << 10
-    #: Maximum number of simultaneous uploads, and of complete pictures that wait to be decoded.
+    #: Maximum number of simultaneous uploads, and of complete pictures that wait to be decoded; a visitor gets half.
     uploads: int = 4
     waiting: int = 8
+    #: Maximum size of the folder of uploads that are stored permanently.
+    keep_bytes: int = 4 << 30
     #: Time within which a client must accept a part of an answer.
     answer_s: float = 30.0
     #: Maximum number of pages that watch the live camera.
@@ -126,6 +133,7 @@ def own_address() -> str:
 class _Upload:
     """A picture being uploaded."""
 
+    visitor: str | None
     begun_s: float
     limit: asyncio.Timeout
     n_bytes: int = 0
@@ -144,12 +152,11 @@ class Server:
 
     def __init__(self, site: Site) -> None:
         self._site = site
-        self._folder = Path(tempfile.mkdtemp(prefix="vlc-rx-serve-"))
-        self._decoder = DecodingProcess(site.options, site.bounds.decoding, self._folder)
+        self._decoder = DecodingProcess(site.options, site.bounds.decoding)
         self._thread = ThreadPoolExecutor(1, "decode")
         self._arriving: list[_Upload] = []
-        #: Callbacks of waiting pictures, in the order of decoding; each receives its place in the queue.
-        self._queue: list[_Publish] = []
+        #: Visitors and callbacks of waiting pictures, in the order of decoding; each receives its place in the queue.
+        self._queue: list[tuple[str | None, _Publish]] = []
         #: Oldest first.
         self._watchers: dict[asyncio.Queue[str], web.Request] = {}
         self._history: deque[str] = deque(maxlen=20)
@@ -180,6 +187,7 @@ class Server:
         site = self._site
         if site.keep is not None:
             claim_folder("--keep", site.keep)
+            self._kept_bytes = sum(path.stat().st_size for path in site.keep.iterdir() if path.is_file())
         app = web.Application(middlewares=[self._guard], client_max_size=1 << 16)
         app.router.add_get(f"{site.prefix}/", self._index)
         app.router.add_get(f"{site.prefix}/asset/{{name}}", self._asset)
@@ -189,7 +197,6 @@ class Server:
             app, access_log=None, keepalive_timeout=site.bounds.idle_s, logger=_requests_log(), shutdown_timeout=1.0
         )
         await self._runner.setup()
-        # Before the first upload: this process removes uploads if the server is killed.
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._thread, self._decoder.start)
         try:
@@ -218,7 +225,6 @@ class Server:
             self._decoder.close()
             self._thread.shutdown(wait=True, cancel_futures=True)
             self._decoder.close()  # what the thread may have started meanwhile
-            shutil.rmtree(self._folder, ignore_errors=True)
 
     # -- access control -----------------------------------------------------------------------------------------------
 
@@ -256,6 +262,9 @@ class Server:
                 raise web.HTTPNotFound(headers=_HEADERS)
         elif host.rsplit(":", 1)[0] not in (*_LOCAL, site.host):
             return False  # a name that somebody else has pointed at this machine
+        is_visit = request.method == "GET" and request.headers.get("Sec-Fetch-Dest") == "document"
+        if not is_visit and request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
+            return False
         origin = request.headers.get("Origin")
         return origin is None or origin in (f"http://{host}", f"https://{host}")
 
@@ -296,31 +305,35 @@ class Server:
 
     async def _photo(self, request: web.Request) -> web.StreamResponse:
         bounds = self._site.bounds
-        self._make_room()
-        if len(self._arriving) >= bounds.uploads or len(self._queue) >= bounds.waiting:
+        self._make_room(request.remote)
+        uploading, waiting = [upload.visitor for upload in self._arriving], [visitor for visitor, _ in self._queue]
+        if _is_full(uploading, bounds.uploads, request.remote) or _is_full(waiting, bounds.waiting, request.remote):
             busy = refusal("other pictures are being read just now", "try again in a few seconds")
             return web.json_response(busy, status=503)
-        path = self._folder / uuid.uuid4().hex
         try:
-            if not await self._save(request, path):
-                large = f"the file is larger than {bounds.upload_bytes >> 20} MB"
-                return _refused(413, large, "send a photo, or a shorter clip")
-            if _LINES in request.headers.get("Accept", ""):
-                return await self._answer_by_and_by(request, path)
-            return web.json_response(await self._decoded(request, path, lambda _: None))
+            # Without a name: whatever ends the server, nothing is left.
+            with TemporaryFile() if _OPEN_FILES.is_dir() else NamedTemporaryFile(prefix="vlc-rx-") as file:
+                path = _OPEN_FILES / str(file.fileno()) if _OPEN_FILES.is_dir() else Path(file.name)
+                if not await self._save(request, file):
+                    large = f"the file is larger than {bounds.upload_bytes >> 20} MB"
+                    return _refused(413, large, "send a photo, or a shorter clip")
+                if _LINES in request.headers.get("Accept", ""):
+                    return await self._answer_by_and_by(request, path)
+                return web.json_response(await self._decoded(request, path, lambda _: None))
         except TimeoutError:
             return _refused(408, "the picture took too long to arrive", "move nearer to the network")
         except OSError as error:
             log.warning("an upload could not be stored: %s", error)
             return _refused(507, "there is no room for the picture", "inform the operator of this page")
-        finally:
-            path.unlink(missing_ok=True)
 
-    def _make_room(self) -> None:
-        """If all upload places are taken, end the slowest upload below the minimum rate."""
+    def _make_room(self, visitor: str | None) -> None:
+        """If all upload places are taken, or a visitor's share, end the slowest such upload below the minimum rate."""
         bounds, now_s = self._site.bounds, asyncio.get_running_loop().time()
-        slow = [upload for upload in self._arriving if upload.is_slow(now_s, bounds.upload_rate)]
-        if slow and len(self._arriving) >= bounds.uploads:
+        taken = [upload for upload in self._arriving if upload.visitor == visitor]
+        if len(self._arriving) >= bounds.uploads:
+            taken = self._arriving
+        slow = [upload for upload in taken if upload.is_slow(now_s, bounds.upload_rate)]
+        if slow and _is_full([upload.visitor for upload in self._arriving], bounds.uploads, visitor):
             slowest = min(slow, key=lambda upload: upload.n_bytes / (now_s - upload.begun_s))
             slowest.limit.reschedule(now_s)
             self._arriving.remove(slowest)
@@ -328,12 +341,13 @@ class Server:
     async def _decoded(self, request: web.Request, path: Path, publish: _Publish) -> dict[str, Any]:
         """Answer of an upload in its turn; `publish` receives its place in the queue and partial answers."""
         loop = asyncio.get_running_loop()
-        self._queue.append(publish)
+        waiting = request.remote, publish
+        self._queue.append(waiting)
         self._publish_places()
         try:
             answer = await loop.run_in_executor(self._thread, self._decode_for, request, path, publish)
         finally:
-            self._queue.remove(publish)
+            self._queue.remove(waiting)
             self._publish_places()
         self._keep(path, answer)
         return answer
@@ -346,7 +360,7 @@ class Server:
 
     def _publish_places(self) -> None:
         """Send their place in the queue to all waiting pictures but the first."""
-        for place, publish in enumerate(self._queue):
+        for place, (_, publish) in enumerate(self._queue):
             if place:
                 publish({"status": "waiting", "place": place, "partial": True})
 
@@ -372,8 +386,8 @@ class Server:
         async with asyncio.timeout(self._site.bounds.answer_s):
             await response.write(json.dumps(answer).encode() + b"\n")
 
-    async def _save(self, request: web.Request, path: Path) -> bool:
-        """Write the body to `path`; returns whether it is small enough.
+    async def _save(self, request: web.Request, file: Any) -> bool:
+        """Write the body to `file`; returns whether it is small enough.
 
         Raises:
             TimeoutError: the upload is too slow.
@@ -383,18 +397,18 @@ class Server:
         if (request.content_length or 0) > bounds.upload_bytes:
             return False
         async with asyncio.timeout(bounds.grace_s) as limit:
-            upload = _Upload(begun_s, limit)
+            upload = _Upload(request.remote, begun_s, limit)
             self._arriving.append(upload)
             try:
-                with path.open("wb") as file:
-                    while chunk := await request.content.read(_CHUNK):
-                        upload.n_bytes += len(chunk)
-                        if upload.n_bytes > bounds.upload_bytes:
-                            return False
-                        file.write(chunk)
-                        late_s = bounds.grace_s + upload.n_bytes / bounds.upload_rate
-                        if upload in self._arriving:
-                            limit.reschedule(begun_s + min(bounds.upload_s, late_s))
+                while chunk := await request.content.read(_CHUNK):
+                    upload.n_bytes += len(chunk)
+                    if upload.n_bytes > bounds.upload_bytes:
+                        return False
+                    file.write(chunk)
+                    late_s = bounds.grace_s + upload.n_bytes / bounds.upload_rate
+                    if upload in self._arriving:
+                        limit.reschedule(begun_s + min(bounds.upload_s, late_s))
+                file.flush()
             finally:
                 if upload in self._arriving:
                     self._arriving.remove(upload)
@@ -406,10 +420,15 @@ class Server:
         if folder is None:
             return
         stem = time.strftime("%Y%m%d-%H%M%S-") + uuid.uuid4().hex[:8]
-        record = {key: value for key, value in answer.items() if key != "picture"}
+        record = json.dumps({key: value for key, value in answer.items() if key != "picture"})
         try:
+            n_bytes = path.stat().st_size + len(record)
+            if self._kept_bytes + n_bytes > self._site.bounds.keep_bytes:
+                log.warning("an upload was not kept: %s holds %d MB; empty it", folder, self._kept_bytes >> 20)
+                return
+            self._kept_bytes += n_bytes
             shutil.copyfile(path, folder / f"{stem}{_suffix(path)}")
-            (folder / f"{stem}.json").write_text(json.dumps(record), encoding="utf-8")
+            (folder / f"{stem}.json").write_text(record, encoding="utf-8")
         except OSError as error:
             log.warning("an upload could not be kept: %s", error)
 
@@ -417,7 +436,8 @@ class Server:
         """Events of the live camera, as server-sent events."""
         if self._site.device is None:
             raise web.HTTPNotFound(headers=_HEADERS)
-        if len(self._watchers) >= self._site.bounds.watchers:
+        watching = [watcher.remote for watcher in self._watchers.values()]
+        if _is_full(watching, self._site.bounds.watchers, request.remote):
             late = [queue for queue, watcher in self._watchers.items() if _is_taking(watcher)]
             if not late:
                 raise web.HTTPServiceUnavailable(text="too many pages watch already", headers=_HEADERS)
@@ -457,6 +477,11 @@ def _from_thread(loop: asyncio.AbstractEventLoop, publish: _Publish) -> _Publish
             loop.call_soon_threadsafe(publish, answer)
 
     return call
+
+
+def _is_full(visitors: list[str | None], n_places: int, visitor: str | None) -> bool:
+    """Whether no place is left, or half of them are a visitor's."""
+    return len(visitors) >= n_places or visitors.count(visitor) >= max(1, n_places // 2)
 
 
 async def _next(queue: asyncio.Queue[str]) -> str:
