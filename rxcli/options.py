@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import msgspec
 import numpy as np
 
-from rxcli.errors import UsageError
+from rxcli.errors import UsageError, shortened
 from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles, load_profile, shipped_profiles
 from rxcli.types import FILE_MEMORY_MB, FloatArray
 
@@ -60,14 +61,14 @@ class ReceiverOptions:
 
 
 def receiver_options(
-    screens: ScreenProfile | str | Sequence[ScreenProfile | str] = AUTO,
-    cameras: CameraProfile | str | Sequence[CameraProfile | str] = AUTO,
+    screens: ScreenProfile | str | Path | Sequence[ScreenProfile | str | Path] = AUTO,
+    cameras: CameraProfile | str | Path | Sequence[CameraProfile | str | Path] = AUTO,
     corners: Any = None,
     *,
     mirrored: bool = False,
     cae: CaeMode = "auto",
     min_confidence: float = 0.0,
-    no_skip: Sequence[str] = (),
+    no_skip: str | Sequence[str] = (),
     stop_when_certain: bool = False,
     denoiser: Denoiser | None = None,
     dump_dir: str | Path | None = None,
@@ -97,17 +98,26 @@ def receiver_options(
         ProfileError: a profile is missing or malformed.
         UsageError: the corners are no convex quadrilateral, or a value is impossible.
     """
-    named = (cameras,) if isinstance(cameras, (str, CameraProfile)) else tuple(cameras)
-    _check_choices(cae, min_confidence, no_skip)
+    named, names = _listed("cameras", cameras), _listed("no_skip", no_skip)
+    flags = {"mirrored": mirrored, "stop_when_certain": stop_when_certain, "soft_bits": soft_bits}
+    check_values(
+        *((name, value, isinstance(value, bool), "True or False") for name, value in flags.items()),
+        ("cae", cae, isinstance(cae, str) and cae in ("auto", "always", "never"), "auto, always or never"),
+        ("min_confidence", min_confidence, is_number(min_confidence, 0) and min_confidence <= 1, "in 0..1"),
+        ("file_memory_mb", file_memory_mb, isinstance(file_memory_mb, int) and file_memory_mb > 0, "whole megabytes"),
+        ("denoiser", denoiser, denoiser is None or hasattr(denoiser, "slot_corrections"), "a denoiser, or None"),
+        ("dump_dir", dump_dir, dump_dir is None or isinstance(dump_dir, (str, Path)), "the path of a folder, or None"),
+        *((f"no_skip: {name!r}", name, name in SKIPS, f"one of {', '.join(SKIPS)}") for name in names),
+    )
     return ReceiverOptions(
-        screens=_profiles(screens, ScreenProfile),
-        cameras=_profiles(cameras, CameraProfile),
+        screens=_profiles(_listed("screens", screens), ScreenProfile),
+        cameras=_profiles(named, CameraProfile),
         force_camera=len(named) == 1 and named[0] != AUTO,
         corners=None if corners is None else _checked_corners(corners),
         mirrored=mirrored,
         cae=cae,
         min_confidence=min_confidence,
-        skip=frozenset(SKIPS) - set(no_skip),
+        skip=frozenset(SKIPS) - set(names),
         stop_when_certain=stop_when_certain,
         denoiser=denoiser,
         # Absolute, since workers may run in other folders.
@@ -117,37 +127,56 @@ def receiver_options(
     )
 
 
-def _profiles(
-    named: ScreenProfile | CameraProfile | str | Sequence[ScreenProfile | CameraProfile | str], kind: type[_Profile]
-) -> tuple[_Profile, ...]:
-    names: tuple[Any, ...] = (named,) if isinstance(named, (str, ScreenProfile, CameraProfile)) else tuple(named)
+def check_values(*rules: tuple[str, Any, bool, str]) -> None:
+    """Refuse values that make no sense: a rule is a name, its value, whether that is right, and what it must be.
+
+    Raises:
+        UsageError: of the first rule that does not hold.
+    """
+    for name, value, is_right, wanted in rules:
+        if not is_right:
+            shown = shortened(" ".join(repr(value).split()))
+            raise UsageError(f"{name} must be {wanted} (got {shown})", "correct it, or leave it out")
+
+
+def is_number(value: Any, min_value: float = -math.inf) -> bool:
+    """Whether a value is a finite number of at least `min_value`."""
+    is_real = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    return bool(is_real and math.isfinite(value) and value >= min_value)
+
+
+def _listed(option: str, given: Any) -> tuple[Any, ...]:
+    """One thing or several, as a tuple."""
+    several = isinstance(given, Iterable) and not isinstance(given, (str, Path))
+    is_one = isinstance(given, (str, Path, ScreenProfile, CameraProfile))
+    check_values((option, given, is_one or several, "a name or several; docs/python.md lists what it takes"))
+    found = tuple(given) if several else (given,)
+    check_values((option, given, bool(found) or option != "screens", "at least one"))
+    return found
+
+
+def _profiles(named: tuple[Any, ...], kind: type[_Profile]) -> tuple[_Profile, ...]:
     found: list[_Profile] = []
-    for name in names:
+    for name in named:
         if isinstance(name, kind):
             # Rebuilt, so that a profile changed by `msgspec.structs.replace` is checked too.
             found.append(kind(**msgspec.structs.asdict(name)))
-        elif not isinstance(name, str):
-            raise UsageError(f"{name!r} is no {kind.__name__}", "give a profile of this kind, its name, or a TOML file")
+        elif not isinstance(name, (str, Path)):
+            reason = f"{shortened(repr(name))} is no {kind.__name__}"
+            raise UsageError(reason, "give a profile of this kind, its name, or a TOML file")
         elif name != AUTO:
             found.append(load_profile(name, kind))
-    return (*found, *([profile for profile, _, _ in known_profiles(kind)] if AUTO in names else ()))
-
-
-def _check_choices(cae: str, min_confidence: float, no_skip: Sequence[str]) -> None:
-    if cae not in ("auto", "always", "never"):
-        raise UsageError(f"cae must be auto, always or never (got {cae!r})")
-    if not 0 <= min_confidence <= 1:
-        raise UsageError(f"min_confidence must be in 0..1 (got {min_confidence})")
-    for name in no_skip:
-        if name not in SKIPS:
-            raise UsageError(f"no_skip: {name!r} is not one of {', '.join(SKIPS)}")
+    return (*found, *([profile for profile, _, _ in known_profiles(kind)] if AUTO in named else ()))
 
 
 def _checked_corners(corners: Any) -> FloatArray:
     """Check that the corners form a convex quadrilateral in the right order."""
-    found: FloatArray = np.array(corners, dtype=np.float64)
-    if found.shape != (4, 2) or not np.all(np.isfinite(found)):
-        raise UsageError(f"corners must be four positions (x, y) in stored pixels (got shape {found.shape})")
+    try:
+        found: FloatArray = np.array(corners, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        found = np.empty(0)
+    is_right = found.shape == (4, 2) and bool(np.all(np.isfinite(found)))
+    check_values(("corners", corners, is_right, "four positions (x, y) in stored pixels"))
     edges = np.roll(found, -1, axis=0) - found
     following = np.roll(edges, -1, axis=0)
     turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]

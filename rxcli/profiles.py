@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar, overload
 import msgspec
 from msgspec import Meta
 
-from rxcli.errors import ProfileError, shortened
+from rxcli.errors import ProfileError, UsageError, shortened
 from rxcli.protocol import packet_slots
 from rxcli.resources import data_dir, profile_dirs, read_limited
 
@@ -253,9 +253,13 @@ def load_profile(name_or_path: str | Path, kind: type[Any] | None = None) -> Any
 
     Raises:
         ProfileError: no such profile, unreadable, or malformed.
+        UsageError: that is no name, or no kind.
     """
     name = str(name_or_path)
     kinds = tuple(_KINDS) if kind is None else (kind,)
+    if not isinstance(name_or_path, (str, Path)) or not name or not set(kinds) <= set(_KINDS):
+        step = "give a name or a TOML file, and ScreenProfile or CameraProfile as the kind"
+        raise UsageError(f"no profile is called {shortened(repr(name_or_path))} (of kind {kind})", step)
     path = next((path for path in (_file_of(name, kind) for kind in kinds) if path != Path(name)), Path(name))
     try:
         text = read_limited(path, _MAX_BYTES).decode("utf-8")

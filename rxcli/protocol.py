@@ -12,6 +12,8 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.errors import UsageError
+
 SLOTS_PER_SYMBOL = 10
 #: Window length, slots, that always contains a lit and a dark slot, whatever the symbols.
 EXTREMES_SLOTS = 2 * SLOTS_PER_SYMBOL - 1
@@ -81,7 +83,15 @@ def indices_to_bits(indices: NDArray[np.int64], w: int) -> NDArray[np.uint8]:
 
 
 def encode_packet(bits: NDArray[np.uint8], w: int) -> NDArray[np.uint8]:
-    """(20 + 10 N,) uint8 slots of 0/1 of a packet with payload `bits`."""
+    """(20 + 10 N,) uint8 slots of 0/1 of a packet with payload `bits`.
+
+    Raises:
+        UsageError: `bits` are no row of 0 and 1.
+        ValueError: there are too few or too many of them for symbols of weight `w`, or `w` is none.
+    """
+    bits = np.asarray(bits)
+    if bits.ndim != 1 or bits.dtype.kind not in "biu" or not np.isin(bits, (0, 1)).all():
+        raise UsageError("the bits of a packet must be a row of 0 and 1", "give payload_bits(w, n_symbols) of them")
     payload = codebook(w)[bits_to_indices(bits, w)].ravel()
     return np.concatenate([np.array(HEADER, np.uint8), dimming_symbol(w), payload])
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -79,7 +81,21 @@ def test_profiles_come_as_names_files_and_values() -> None:
     [
         ({"cae": "sometimes"}, "cae must be auto, always or never"),
         ({"min_confidence": 1.5}, r"min_confidence must be in 0\.\.1 \(got 1\.5\)"),
-        ({"no_skip": ["nothing"]}, "no_skip: 'nothing' is not one of"),
+        ({"no_skip": ["nothing"]}, "no_skip: 'nothing' must be one of"),
+        ({"no_skip": None}, "no_skip must be"),
+        ({"mirrored": None}, r"mirrored must be True or False \(got None\)"),
+        ({"min_confidence": None}, "min_confidence must be in"),
+        ({"min_confidence": float("nan")}, "min_confidence must be in"),
+        ({"file_memory_mb": None}, "file_memory_mb must be"),
+        ({"dump_dir": 5}, "dump_dir must be"),
+        ({"denoiser": 5}, "denoiser must be"),
+        ({"corners": "abc"}, "four positions"),
+        ({"corners": [[0, 0], [1]]}, "four positions"),
+        ({"screens": None}, "screens must be"),
+        ({"screens": []}, "screens must be at least one"),
+        ({"screens": rxcli.ScreenProfile}, "screens must be"),
+        ({"cameras": 5}, "cameras must be"),
+        ({"cameras": Path("none.toml")}, "no profile 'none.toml' among cameras"),
         ({"corners": [[0, 0], [9, 9], [9, 0], [0, 9]]}, "once round a convex outline"),
         ({"corners": [[0, 0], [9, 9]]}, r"four positions \(x, y\)"),
         ({"screens": [7]}, "7 is no ScreenProfile"),
@@ -119,11 +135,73 @@ def test_an_array_is_a_picture() -> None:
         (np.zeros((4, 4)), "must be a"),
         (np.zeros(9, np.uint8), "must be a"),
         (CLIP, "more than one frame; use receive"),
+        *((picture, r"must be a path, a Frame or .* \(got ") for picture in (None, [], [[1, 2]], 5, b"a")),
+        *((np.zeros(shape, np.uint8), "must be a path") for shape in ((0, 0), (0, 9), (9, 0))),
+        ("", "must be the path of a file"),
     ],
 )
-def test_what_is_no_photo_is_refused(picture: NDArray[np.generic] | Path, reason: str) -> None:
+def test_what_is_no_photo_is_refused(picture: Any, reason: str) -> None:
+    for call in (KNOWN.decode, KNOWN.tap):
+        with pytest.raises(rxcli.UsageError, match=reason) as caught:
+            call(picture)
+        assert caught.value.hint
+
+
+GREY, NAN = np.zeros((60, 80), np.uint8), float("nan")
+MOSAIC = rxcli.Mosaic(np.zeros((2, 2), np.uint8), (1.0, 1.0, 1.0), (0.0, 0.0, 0.0), 255.0)
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        *(
+            ({"pixels": pixels}, "must be a path, a Frame")
+            for pixels in (None, [[1]], GREY[:0], GREY * 0.5, GREY[None])
+        ),
+        *(({"white": white}, "white must be") for white in (NAN, None, "1", -1.0, 0.0)),
+        *(({"metadata": rxcli.Metadata(exposure_s=s)}, "exposure_s must") for s in (NAN, 0.0, -1.0, float("inf"), "1")),
+        ({"metadata": rxcli.Metadata(iso=NAN)}, "iso must be"),
+        ({"metadata": rxcli.Metadata(orientation=9)}, "orientation must be"),
+        ({"metadata": None}, "metadata must be"),
+        ({"source": None}, "source must be"),
+        ({"index": -1}, "index must be"),
+        ({"time_s": NAN}, "time_s must be"),
+        ({"mosaic": 5}, "mosaic must be"),
+        ({"mosaic": replace(MOSAIC, pattern=GREY[:0])}, r"mosaic\.pattern must be"),
+        ({"mosaic": replace(MOSAIC, pattern=GREY[:2, :2] + 7)}, r"mosaic\.pattern must be"),
+        ({"mosaic": replace(MOSAIC, gains=(NAN, 1.0, 1.0))}, r"mosaic\.gains must be"),
+        ({"mosaic": replace(MOSAIC, black=(0.0, 0.0, 300.0))}, r"mosaic\.white must be"),
+    ],
+)
+def test_a_frame_with_impossible_values_is_refused(changed: dict[str, Any], reason: str) -> None:
+    frame = replace(rxcli.Frame(GREY, "mine"), **changed)
+    with pytest.raises(rxcli.UsageError, match=reason) as caught:
+        KNOWN.decode(frame)
+    assert caught.value.hint
     with pytest.raises(rxcli.UsageError, match=reason):
-        KNOWN.decode(picture)
+        next(KNOWN.receive([frame]))
+
+
+@pytest.mark.parametrize("source", [None, 5, GREY, rxcli.Frame(GREY, "mine")])
+def test_what_is_received_is_a_path_or_several_pictures(source: Any) -> None:
+    with pytest.raises(rxcli.UsageError, match="use decode for one picture"):
+        KNOWN.receive(source)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        *(lambda name=name: rxcli.load_profile(name) for name in (None, 5, [], "")),
+        lambda: rxcli.load_profile("xs10", int),  # type: ignore[type-var]
+        lambda: rxcli.Receiver.with_options(None),  # type: ignore[arg-type]
+        *(lambda path=path: next(iter(rxcli.open_source(path))) for path in (None, 5, [], "")),
+        *(lambda bits=bits: rxcli.encode_packet(bits, 5) for bits in (None, "0101010", [2] * 7, [[0] * 7])),
+    ],
+)
+def test_other_arguments_that_are_none_are_refused(call: Callable[[], object]) -> None:
+    with pytest.raises(rxcli.UsageError) as caught:
+        call()
+    assert caught.value.hint
 
 
 def test_arrays_without_a_screen_are_numbered_and_have_no_taps() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from rxcli.errors import InputError
+from rxcli.errors import InputError, UsageError
 from rxcli.ingest.sniff import HEAD_BYTES, KNOWN_SUFFIXES, Kind, check_file, check_no_list, read_bytes, sniff
 from rxcli.types import Frame
 
@@ -27,6 +27,8 @@ def open_source(path: str | Path) -> Iterator[Frame]:
     Raises:
         InputError: the source cannot be read, or breaks off (after the whole frames before the break).
     """
+    if not isinstance(path, (str, Path)) or not str(path):
+        raise UsageError(f"a source must be the path of a file or device (got {path!r:.80})", "give a path")
     path = Path(path)
     kind = check_file(path) or _kind(path)
     if kind is None:

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from rxcli.errors import InputError, UsageError
 from rxcli.ingest import open_source
-from rxcli.options import ReceiverOptions, receiver_options
+from rxcli.options import ReceiverOptions, check_values, is_number, receiver_options
 from rxcli.receiver.pipeline import receive as receive_frames
 from rxcli.receiver.pipeline import receive_frame
 from rxcli.results.dump import Taps, read_taps
 from rxcli.runs.batch import standard_decoder
-from rxcli.types import Frame, FrameResult
+from rxcli.types import Frame, FrameResult, Metadata, Mosaic
 
 #: A picture: a file, an array of grey values, or a frame with what is known of it.
 Picture = str | Path | NDArray[Any] | Frame
@@ -43,6 +43,7 @@ class Receiver:
     @classmethod
     def with_options(cls, options: ReceiverOptions) -> Self:
         """A receiver whose options are made already."""
+        check_values(("options", options, isinstance(options, ReceiverOptions), "ReceiverOptions"))
         receiver = cls.__new__(cls)
         receiver.options = options
         return receiver
@@ -59,7 +60,7 @@ class Receiver:
 
         Raises:
             InputError: the file cannot be read.
-            UsageError: the file is a clip, or the array is no picture.
+            UsageError: the file is a clip, the array is no picture, or the frame is impossible.
         """
         (result,) = self._with_messages(iter([receive_frame(_frame_of(picture), self.options)]))
         return result
@@ -76,8 +77,12 @@ class Receiver:
 
         Raises:
             InputError: the file cannot be read, or, after the results before the break, it breaks off.
-            UsageError: an array is no picture.
+            UsageError: an array is no picture, or a frame is impossible.
         """
+        several = isinstance(source, Iterable) and not (isinstance(source, np.ndarray) and source.ndim < 3)
+        if not several and not isinstance(source, Path):
+            reason = f"what is received must be a path, or several pictures (got {type(source).__name__})"
+            raise UsageError(reason, "give a path or a list of pictures; use decode for one picture")
         frames = open_source(source) if isinstance(source, (str, Path)) else _numbered(source)
         return self._with_messages(receive_frames(frames, self.options))
 
@@ -117,6 +122,7 @@ def tap(picture: Picture, **options: Any) -> tuple[FrameResult, Taps | None]:
 
 def _frame_of(picture: Picture) -> Frame:
     if isinstance(picture, Frame):
+        _check_frame(picture)
         return picture
     if not isinstance(picture, (str, Path)):
         return frame_of_array(picture)
@@ -134,14 +140,50 @@ def frame_of_array(pixels: NDArray[Any]) -> Frame:
     """A frame of grey values as a camera stores them, rows in the order of readout.
 
     Raises:
-        UsageError: not (height, width) of uint8 or uint16.
+        UsageError: not (height, width) of uint8 or uint16, or empty.
     """
-    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
+    is_array = isinstance(pixels, np.ndarray)
+    if not is_array or pixels.ndim != 2 or not pixels.size or pixels.dtype not in (np.uint8, np.uint16):
+        shown = f"{pixels.shape} of {pixels.dtype}" if is_array else type(pixels).__name__
         raise UsageError(
-            f"a picture must be a (height, width) array of uint8 or uint16 (got {pixels.shape} of {pixels.dtype})",
-            "of a colour picture take the green channel, or its luma",
+            f"a picture must be a path, a Frame or a (height, width) array of uint8 or uint16 (got {shown})",
+            "of a colour picture take the green channel, or its luma; convert lists and others to such an array",
         )
     return Frame(pixels, "array", white=float(np.iinfo(pixels.dtype).max))
+
+
+def _check_frame(frame: Frame) -> None:
+    """Refuse a frame whose values are impossible.
+
+    Raises:
+        UsageError: of the first such value.
+    """
+    frame_of_array(frame.pixels)
+    about, mosaic = frame.metadata, frame.mosaic
+    check_values(
+        ("metadata", about, isinstance(about, Metadata), "Metadata"),
+        ("mosaic", mosaic, mosaic is None or isinstance(mosaic, Mosaic), "a Mosaic, or None"),
+        ("source", frame.source, isinstance(frame.source, str), "a text that names the picture"),
+        ("index", frame.index, is_number(frame.index, 0), "a number from 0"),
+        ("time_s", frame.time_s, is_number(frame.time_s), "finite seconds"),
+    )
+    positive = {name: getattr(about, name) for name in ("exposure_s", "iso", "focal_length_mm", "focal_length_35mm")}
+    check_values(
+        *((name, value, value is None or is_number(value, 1e-12), "above 0") for name, value in positive.items()),
+        ("orientation", about.orientation, about.orientation in range(1, 9), "in 1..8"),
+    )
+    levels = [("", frame.black, frame.white)]
+    if mosaic is not None:
+        colours = np.asarray(mosaic.pattern)
+        is_pattern = colours.ndim == 2 and colours.size > 0 and bool(np.isin(colours, range(3)).all())
+        check_values(("mosaic.pattern", mosaic.pattern, is_pattern, "a (h, w) array of the colours 0, 1, 2"))
+        for name, values, low in (("gains", mosaic.gains, 1e-12), ("black", mosaic.black, -np.inf)):
+            is_right = np.shape(values) == (3,) and all(is_number(value, low) for value in values)
+            check_values((f"mosaic.{name}", values, is_right, "three finite numbers"))
+        levels += [("mosaic.", black, mosaic.white) for black in mosaic.black]
+    for of, black, white in levels:
+        are_right = is_number(black) and is_number(white) and black < white
+        check_values((f"{of}white", (black, white), are_right, f"a number above that of {of}black"))
 
 
 def _numbered(pictures: Iterable[Picture]) -> Iterator[Frame]:
