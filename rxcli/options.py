@@ -107,8 +107,10 @@ def receiver_options(
         ("file_memory_mb", file_memory_mb, isinstance(file_memory_mb, int) and file_memory_mb > 0, "whole megabytes"),
         ("denoiser", denoiser, denoiser is None or hasattr(denoiser, "slot_corrections"), "a denoiser, or None"),
         ("dump_dir", dump_dir, dump_dir is None or isinstance(dump_dir, (str, Path)), "the path of a folder, or None"),
-        *((f"no_skip: {name!r}", name, name in SKIPS, f"one of {', '.join(SKIPS)}") for name in names),
     )
+    for name in names:
+        if name not in SKIPS:
+            raise UsageError(f"no_skip: {name!r} is not one of {', '.join(SKIPS)}", "name one of them, or none")
     return ReceiverOptions(
         screens=_profiles(_listed("screens", screens), ScreenProfile),
         cameras=_profiles(named, CameraProfile),
