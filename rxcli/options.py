@@ -6,17 +6,14 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
 
 from rxcli.errors import UsageError, shortened
 from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles, load_profile, shipped_profiles
-from rxcli.types import FILE_MEMORY_MB, FloatArray
-
-if TYPE_CHECKING:
-    from rxcli.receiver.channel.denoise import Denoiser
+from rxcli.types import FILE_MEMORY_MB, Denoiser, FloatArray
 
 CaeMode = Literal["auto", "always", "never"]
 #: Names of shortcuts for `ReceiverOptions.skip`; the report counts each use.
@@ -50,7 +47,7 @@ class ReceiverOptions:
     #: Report the first frames of a clip early instead of waiting for a better picture, as for a camera that is being
     #: aimed.
     prompt: bool = False
-    #: Replacement of the shipped auto-encoder; see `rxcli.receiver.channel.denoise.Denoiser`.
+    #: Replacement of the shipped auto-encoder; see `rxcli.types.Denoiser`.
     denoiser: Denoiser | None = None
     #: Folder for the arrays of every stage boundary, or None.
     dump_dir: Path | None = None

@@ -8,8 +8,9 @@ stored picture, which is never rotated. The time of a sensor row is the start of
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, Self
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,25 @@ FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
+#: Is given the arrays at the stage boundaries of a received frame: source, number of the frame, stage -> array or
+#: dataclass of arrays.
+OnTaps = Callable[[str, int, dict[str, Any]], object]
+
+
+class Denoiser(Protocol):
+    """Interface of a model that corrects slot log-likelihood ratios."""
+
+    @property
+    def name(self) -> str:
+        """Name for reports."""
+
+    def slot_corrections(self, scene: Any, columns: IntArray) -> Float32Array:
+        """(len(columns), N) values to add to ln p(light | lit) - ln p(light | dark) of every slot of `columns`.
+
+        Args:
+            scene: `rxcli.receiver.channel.denoise.DenoiserInput`, after `remove_row_noise`.
+            columns: numbers of the columns.
+        """
 
 
 @dataclass(frozen=True, slots=True)

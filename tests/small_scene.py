@@ -9,7 +9,7 @@ import msgspec
 from rxcli.lab.benchmark.trial import Trial
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.pipeline import receive
+from rxcli.receiver.receive import receive
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import FrameResult
 

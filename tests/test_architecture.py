@@ -17,6 +17,8 @@ DATA = BASE | {"rxcli.types", "rxcli.protocol", "rxcli.profiles"}
 GROUND = DATA | {"rxcli.numerics", "rxcli.receiver.light"}
 #: Rooms of the receiver that turn one thing into the next, and know nothing of one another.
 STAGES = ("plane", "screen", "camera", "sync", "channel", "decode")
+#: Rooms that wire the stages; each uses those before it.
+WIRING = ("frame", "still", "search", "clip", "receive")
 #: Rooms and files of `rxcli/`: the listing alone shows the way of the data.
 MAX_FOLDERS, MAX_FILES = 9, 9
 #: Too heavy to be loaded by a module that does not need it at once (milliseconds each on import: 70 to 1000).
@@ -83,10 +85,19 @@ def test_the_listing_is_short() -> None:
     assert sum(path.suffix == ".py" for path in shown) <= MAX_FILES
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_stages_stand_on_the_ground_and_never_on_each_other(stage: str) -> None:
-    for name in below(f"receiver.{stage}"):
-        assert own(imports(MODULES[name])) <= GROUND | set(below(f"receiver.{stage}")), name
+def test_every_part_of_the_receiver_is_a_room() -> None:
+    rooms = below(*(f"receiver.{room}" for room in ("light", *STAGES, *WIRING)))
+    assert rooms == [name for name in below("receiver") if name != "rxcli.receiver"]
+
+
+@pytest.mark.parametrize("room", [*STAGES, *WIRING])
+def test_stages_know_nothing_of_each_other_and_only_the_wiring_joins_them(room: str) -> None:
+    allowed = GROUND | set(below(f"receiver.{room}"))
+    if room in WIRING:
+        before = (*STAGES, *WIRING[: WIRING.index(room)])
+        allowed |= {"rxcli.options", "rxcli.receiver", *below(*(f"receiver.{room}" for room in before))}
+    for name in below(f"receiver.{room}"):
+        assert own(imports(MODULES[name])) <= allowed, name
 
 
 @pytest.mark.parametrize(
@@ -94,7 +105,7 @@ def test_stages_stand_on_the_ground_and_never_on_each_other(stage: str) -> None:
     [
         ("ingest", ()),
         ("link", ()),
-        ("receiver", ("ingest", "results.dump", "link")),
+        ("receiver", ()),
         ("results", ("receiver", "ingest", "link")),
         ("runs", ("receiver", "ingest", "results", "link")),
         ("calibrate", ("receiver", "ingest")),
@@ -120,6 +131,7 @@ def test_no_module_imports_itself_through_others() -> None:
     ("places", "allowed"),
     [
         (("protocol", "types", "errors", "outputs", "resources"), BASE),
+        (("profiles", "options"), DATA),
         # A wrong equation shared with the receiver would cancel in every round trip.
         (("lab.simulate",), BASE | {"rxcli.protocol", "rxcli.profiles", *below("lab.simulate")}),
         # Reports know results only.
@@ -128,7 +140,7 @@ def test_no_module_imports_itself_through_others() -> None:
             DATA | {"rxcli.results.record", "rxcli.results.columns"},
         ),
     ],
-    ids=["base", "simulator", "reports"],
+    ids=["base", "data", "simulator", "reports"],
 )
 def test_what_some_stand_on(places: tuple[str, ...], allowed: set[str]) -> None:
     for name in below(*places):
@@ -141,11 +153,12 @@ def test_what_some_stand_on(places: tuple[str, ...], allowed: set[str]) -> None:
         ("torch", ("lab.training",)),
         ("click", ("cli",)),
         ("rxcli.cli", ("cli",)),
-        ("rxcli.receiver.pipeline", ("calibrate", "cli", "lab", "runs", "web")),
+        ("rxcli.receiver.frame", ("receiver", "lab.training")),
+        ("rxcli.receiver.receive", ("calibrate", "cli", "lab", "runs", "web")),
     ],
 )
 def test_what_is_imported_by_some_alone(library: str, users: tuple[str, ...]) -> None:
-    """Only training needs torch, nothing below imports the command line, and only those above it call the pipeline."""
+    """Only training needs torch, nothing below imports the command line, and only those above it call the receiver."""
     importers = {
         name for name, tree in MODULES.items() if any(f"{f}.".startswith(f"{library}.") for f in imports(tree))
     }

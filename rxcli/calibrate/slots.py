@@ -14,7 +14,7 @@ from rxcli.errors import ReceiverError
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.camera import camera_profile
-from rxcli.receiver.pipeline import receive_frame
+from rxcli.receiver.receive import receive_frame
 from rxcli.types import Frame
 
 _CORRECTED = "the camera corrected its lens distortion: line delay and distortion were estimated together"

@@ -269,7 +269,7 @@ class _Run:
 
     def _save_camera(self, path: Path) -> None:
         from rxcli.receiver.camera import camera_profile
-        from rxcli.receiver.turned import as_received
+        from rxcli.receiver.plane.orientation import as_received
 
         if self._estimated is None:
             log.error("%s was not written: no packet was received with an estimated camera", path)

@@ -63,7 +63,7 @@ def live(device: Path, **options: Any) -> int:
     from rxcli.ingest.v4l2 import LiveSource
     from rxcli.link.collector import Collector
     from rxcli.link.saving import save_objects
-    from rxcli.receiver.pipeline import receive
+    from rxcli.receiver.receive import receive
 
     source = LiveSource(
         device,

@@ -1,4 +1,4 @@
 """Receiver: from a frame to packets by screen, plane, camera, sync, channel and decode.
 
-`pipeline.receive_frame` reads as the block diagram; `still` and `clip` run the stages of photographs and clips.
+`receive.receive_frame` reads as the block diagram; `still` and `clip` run the stages of photographs and clips.
 """

@@ -13,20 +13,14 @@ from numpy.typing import NDArray
 from rxcli.errors import ReceiverError
 from rxcli.options import ReceiverOptions
 from rxcli.receiver import channel
-from rxcli.receiver.acquisition import Acquisition, noise_of
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import detect
+from rxcli.receiver.frame.acquisition import Acquisition, noise_of
+from rxcli.receiver.frame.passes import Reception, best_log_prob, dark_columns, packet_llr, word_log_prob
+from rxcli.receiver.frame.settings import SETTINGS, STILL
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma, slot_llr
-from rxcli.receiver.reception import (
-    Reception,
-    best_log_prob,
-    dark_columns,
-    packet_llr,
-    word_log_prob,
-)
-from rxcli.receiver.settings import SETTINGS, STILL
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, SlotSamples
+from rxcli.types import BurstPosteriors, Clock, Denoiser, Float32Array, FloatArray, SlotSamples
 
 
 def decode_photograph(acquisition: Acquisition, skip: frozenset[str], initial: Reception) -> Reception:
@@ -212,7 +206,7 @@ def _worth_showing(reception: Reception, columns: NDArray[np.int64]) -> NDArray[
 
 
 @lru_cache(maxsize=1)
-def _denoiser() -> denoise.Denoiser:
+def _denoiser() -> Denoiser:
     return denoise.load_denoiser()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from rxcli.errors import InputError
 from rxcli.outputs import TAPS, check_replaceable, make_parent, replacing
-from rxcli.types import BurstPosteriors, Clock, FloatArray, RowProfiles, SlotSamples
+from rxcli.types import BurstPosteriors, Clock, FloatArray, OnTaps, RowProfiles, SlotSamples
 
 _Stage = TypeVar("_Stage", RowProfiles, Clock, SlotSamples, BurstPosteriors)
 
@@ -61,6 +62,11 @@ def _stage(arrays: Mapping[str, Any], name: str, kind: type[_Stage]) -> _Stage:
     found: dict[str, Any] = {item.name: arrays.get(f"{name}.{item.name}") for item in fields(kind)}
     scalars = {key: value.item() for key, value in found.items() if value is not None and not value.ndim}
     return kind(**(found | scalars))
+
+
+def taps_writer(folder: Path | None) -> OnTaps | None:
+    """Writes the taps of every frame to a folder, or None; see `dump_stages`."""
+    return None if folder is None else partial(dump_stages, folder)
 
 
 def dump_stages(folder: Path, source: str, frame: int, stages: Mapping[str, Any]) -> Path:

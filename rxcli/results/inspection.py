@@ -14,7 +14,7 @@ from rxcli.protocol import bits_per_symbol, encode_packet, hex_to_bits
 from rxcli.receiver import camera as blind
 from rxcli.receiver import plane
 from rxcli.receiver.decode import assemble
-from rxcli.receiver.turned import as_received
+from rxcli.receiver.plane.orientation import as_received
 from rxcli.results.overlay import outlines_of
 from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, RowProfiles
 

@@ -22,17 +22,17 @@ _LOW, _RANGE = 20, 215
 def column_map(frame: Frame) -> dict[str, Any] | None:
     """Coherent strips, with the grid of columns that was found; None for tiny pictures."""
     from rxcli.options import ReceiverOptions
-    from rxcli.receiver.corners import layouts_of
     from rxcli.receiver.plane import read_plane
     from rxcli.receiver.screen.bright import bright_quadrilateral
     from rxcli.receiver.screen.find import MIN_SIZE_PX, find_screens
     from rxcli.receiver.screen.strips import read_strips
+    from rxcli.receiver.search.outlines import layouts_of
 
     if min(frame.width, frame.height) < MIN_SIZE_PX:
         return None
     plane = read_plane(frame)
     screens = find_screens(plane, layouts_of(ReceiverOptions()), bright=bright_quadrilateral(plane))
-    grids = [screen[0].grid for screen in screens[:1]]
+    grids = [screen[0].grid for screen in screens[:1] if screen[0].grid is not None]
     scale = _WIDTH / frame.width
     return {
         "title": "Where the columns may be",

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.profiles import CameraProfile, ScreenProfile
+from rxcli.receiver.plane.orientation import as_received, turned_points
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.turned import as_received, turned_points
 from rxcli.results.undistort import grey_levels
 from rxcli.types import FloatArray, Frame, FrameResult, Outlines
 

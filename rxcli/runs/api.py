@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from rxcli.errors import InputError, UsageError
 from rxcli.ingest import open_source
 from rxcli.options import ReceiverOptions, check_values, is_number, receiver_options
-from rxcli.receiver.pipeline import receive as receive_frames
-from rxcli.receiver.pipeline import receive_frame
-from rxcli.results.dump import Taps, read_taps
+from rxcli.receiver.receive import receive as receive_frames
+from rxcli.receiver.receive import receive_frame
+from rxcli.results.dump import Taps, read_taps, taps_writer
 from rxcli.runs.batch import standard_decoder
 from rxcli.types import Frame, FrameResult, Metadata, Mosaic
 
@@ -62,7 +62,8 @@ class Receiver:
             InputError: the file cannot be read.
             UsageError: the file is a clip, the array is no picture, or the frame is impossible.
         """
-        (result,) = self._with_messages(iter([receive_frame(_frame_of(picture), self.options)]))
+        on_taps = taps_writer(self.options.dump_dir)
+        (result,) = self._with_messages(iter([receive_frame(_frame_of(picture), self.options, on_taps)]))
         return result
 
     def receive(self, source: str | Path | Iterable[Picture]) -> Iterator[FrameResult]:
@@ -84,7 +85,7 @@ class Receiver:
             reason = f"what is received must be a path, or several pictures (got {type(source).__name__})"
             raise UsageError(reason, "give a path or a list of pictures; use decode for one picture")
         frames = open_source(source) if isinstance(source, (str, Path)) else _numbered(source)
-        return self._with_messages(receive_frames(frames, self.options))
+        return self._with_messages(receive_frames(frames, self.options, taps_writer(self.options.dump_dir)))
 
     def _with_messages(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
         """Results with the texts and files that they complete; the last one with what is left of others."""
@@ -99,8 +100,8 @@ class Receiver:
         """
         frame = _frame_of(picture)
         with TemporaryDirectory(prefix="vlc-rx-") as folder:
-            with_taps = replace(self.options, dump_dir=Path(folder))
-            (result,) = self._with_messages(iter([receive_frame(frame, with_taps)]))
+            on_taps = taps_writer(Path(folder))
+            (result,) = self._with_messages(iter([receive_frame(frame, self.options, on_taps)]))
             written = next(Path(folder).iterdir(), None)
             return result, None if written is None else read_taps(written)
 

@@ -27,7 +27,7 @@ from rxcli.link.collector import Collector
 from rxcli.options import ReceiverOptions
 from rxcli.outputs import OUTPUT_MARKER
 from rxcli.profiles import ScreenProfile
-from rxcli.results.dump import plain_name
+from rxcli.results.dump import plain_name, taps_writer
 from rxcli.runs.processes import ONE_THREAD, environment, start_process
 from rxcli.types import FILE_MEMORY_MB, Frame, FrameResult
 
@@ -54,7 +54,7 @@ _FIRST_DECIDES = (signal.SIGINT, signal.SIGTERM)
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
 _AHEAD = 32
 #: What receiving a photo loads.
-_LOADED = ("rxcli.receiver.pipeline", "cv2", "numpy.ma")
+_LOADED = ("rxcli.receiver.receive", "cv2", "numpy.ma")
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,9 +264,9 @@ def _receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[Fram
         head = list(islice(frames, 1))
     finally:
         loading.join()
-    from rxcli.receiver.pipeline import receive
+    from rxcli.receiver.receive import receive
 
-    yield from receive(chain(head, frames), options)
+    yield from receive(chain(head, frames), options, taps_writer(options.dump_dir))
 
 
 def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded]:

@@ -18,7 +18,7 @@ from rxcli.ingest import open_source
 from rxcli.options import ReceiverOptions, receiver_options
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import bits_per_symbol
-from rxcli.receiver.pipeline import receive
+from rxcli.receiver.receive import receive
 from rxcli.results.cameras import camera_of
 from rxcli.results.inspection import Inspection, decided_slots, inspect_frame
 from rxcli.runs.batch import collect_sources

@@ -50,13 +50,13 @@ def loaded_by(*arguments: str) -> set[str]:
 def test_help_loads_nothing_heavy(arguments: tuple[str, ...]) -> None:
     loaded = loaded_by(*arguments)
     assert "click" in loaded
-    assert not loaded & {"numpy", "msgspec", "cv2", "av", "rawpy", "onnxruntime", "tqdm", "rxcli.receiver.pipeline"}
+    assert not loaded & {"numpy", "msgspec", "cv2", "av", "rawpy", "onnxruntime", "tqdm", "rxcli.receiver.receive"}
 
 
 def test_one_photo_loads_only_what_it_needs() -> None:
     """Half of its time is the loading of packages."""
     loaded = loaded_by("decode", str(Path(__file__).resolve().parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"))
-    assert "rxcli.receiver.pipeline" in loaded
+    assert "rxcli.receiver.receive" in loaded
     assert not loaded & {"tqdm", "email", "scipy", "av", "rawpy", "skimage", "tifffile", "threadpoolctl"}
 
 

@@ -27,7 +27,7 @@ from rxcli.lab.benchmark.media import bare_decode, write_known
 from rxcli.lab.benchmark.runner import Run, Task, do, load_journal, scenarios
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
-from rxcli.receiver.pipeline import receive
+from rxcli.receiver.receive import receive
 from rxcli.types import FrameResult
 
 

@@ -23,10 +23,11 @@ from rxcli.lab.benchmark.cases import nonsense, problems_in
 from rxcli.lab.benchmark.draw import small, small_scene
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import Scene, preset
+from rxcli.options import ReceiverOptions
 from rxcli.protocol import encode_packet, payload_bits
 from rxcli.receiver.decode import detect
-from rxcli.receiver.pipeline import ReceiverOptions, receive
-from rxcli.receiver.plane import store
+from rxcli.receiver.frame import cache
+from rxcli.receiver.receive import receive
 from rxcli.results.record import to_record
 from rxcli.types import FloatArray, Frame, FrameResult
 
@@ -133,7 +134,7 @@ def test_hostile_scenes(make: Callable[[float], Scene], value: float) -> None:
 @pytest.mark.parametrize(("value", "share"), [(np.nan, 0.001), (np.inf, 0.001), (np.nan, 1.1), (1e30, 0.001)])
 def test_damaged_row_profiles(value: float, share: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """As a damaged dump would hold them."""
-    original = store.sample_rows
+    original = cache.sample_rows
 
     def sample(*args: Any, **kwargs: Any) -> Any:
         profiles = original(*args, **kwargs)
@@ -141,7 +142,7 @@ def test_damaged_row_profiles(value: float, share: float, monkeypatch: pytest.Mo
         light[np.random.default_rng(4).random(light.shape) < share] = value
         return replace(profiles, light=light)
 
-    monkeypatch.setattr(store, "sample_rows", sample)
+    monkeypatch.setattr(cache, "sample_rows", sample)
     received(base_trial().frame, base_trial().options())
 
 

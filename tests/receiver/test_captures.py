@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from rxcli.ingest import open_source
+from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile
 from rxcli.protocol import hex_to_bits, packet_slots
-from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.receiver.receive import receive
 from rxcli.types import FrameResult
 
 

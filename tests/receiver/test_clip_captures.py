@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from rxcli.ingest import open_source
+from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile
-from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.receiver.receive import receive
 from rxcli.results.truth import Scorer, Truth, load_truth, truth_path
 from rxcli.types import PacketResult
 

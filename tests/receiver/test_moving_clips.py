@@ -20,8 +20,8 @@ from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver.clip.common_clock import Start
-from rxcli.receiver.context import FrameContext
-from rxcli.receiver.pipeline import receive
+from rxcli.receiver.frame.context import FrameContext
+from rxcli.receiver.receive import receive
 from rxcli.receiver.screen.registration import ScreenTexture
 from rxcli.receiver.sync.tracking import LinkTime
 from rxcli.results.truth import Score, Scorer, Truth

@@ -7,8 +7,8 @@ import pytest
 
 from rxcli.options import SKIPS
 from rxcli.receiver import still
-from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.reception import Reception
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.passes import Reception
 from rxcli.types import BurstPosteriors, Clock
 
 CLOCK = Clock(

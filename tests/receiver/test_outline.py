@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, load_profile
-from rxcli.receiver.context import Outline, Timer
-from rxcli.receiver.corners import possible_screens
+from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.grid import grid_between
+from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search.numbers import numbered
+from rxcli.receiver.search.outlines import possible_screens
 from rxcli.receiver.search.propose import likeliest_of_family
 from rxcli.types import FloatArray, Frame
 
@@ -72,7 +73,7 @@ LARGE = np.array([[-160.0, 300.0], [1380.0, 280.0], [1400.0, 1170.0], [-180.0, 1
 
 
 def test_a_screen_larger_than_the_picture_has_its_columns_counted_from_the_left_of_what_is_seen() -> None:
-    [candidates] = possible_screens(Frame(drawn(0, 20, LARGE), "drawn"), OPTIONS, Timer())
+    [candidates] = possible_screens(FrameCache(Frame(drawn(0, 20, LARGE), "drawn")), OPTIONS)
     best = likeliest(candidates)
     assert best.column_offset is None
     assert best.is_counted_from_left
@@ -85,7 +86,7 @@ def test_a_screen_larger_than_the_picture_has_its_columns_counted_from_the_left_
 
 def test_a_side_in_view_tells_the_columns_of_a_screen_that_goes_on_outside_the_picture() -> None:
     corners = LARGE + np.array([300.0, 0.0])
-    [candidates] = possible_screens(Frame(drawn(0, 20, corners), "drawn"), OPTIONS, Timer())
+    [candidates] = possible_screens(FrameCache(Frame(drawn(0, 20, corners), "drawn")), OPTIONS)
     best = likeliest(candidates)
     assert best.column_offset == 0
     assert abs(float(grid_between(corners, COLUMNS, (WIDTH, HEIGHT), None).columns_at(best.corners)[0])) < 0.3

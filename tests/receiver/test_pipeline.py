@@ -15,16 +15,17 @@ from small_scene import reception
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.capture import Capture, simulate_frame
 from rxcli.lab.simulate.scenes import Scene, preset
+from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
 from rxcli.receiver import channel, still
 from rxcli.receiver.channel import denoise
-from rxcli.receiver.context import Timer
 from rxcli.receiver.decode import detect
-from rxcli.receiver.pipeline import ReceiverOptions, receive, receive_frame
-from rxcli.receiver.reception import headerless
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.passes import headerless
+from rxcli.receiver.plane.orientation import as_received
+from rxcli.receiver.receive import receive, receive_frame
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.still import initial_pass
-from rxcli.receiver.turned import as_received
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Clock, Frame, FrameResult, Metadata, Mosaic, PacketResult
 
@@ -481,7 +482,7 @@ def test_slots_of_few_rows_are_received_although_developing_mixes_rows() -> None
 
 
 def found_in(taken: Capture, options: ReceiverOptions) -> Found:
-    found = search(frame_of(taken), options, Timer())
+    found = search(FrameCache(frame_of(taken)), options)
     assert isinstance(found, Found)
     return found
 

@@ -14,8 +14,9 @@ from rxcli.lab.simulate.capture import prepare
 from rxcli.lab.simulate.no_data import no_data_scene
 from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.truth import build_camera_profile
+from rxcli.options import ReceiverOptions
 from rxcli.receiver.decode.steady import is_common_light
-from rxcli.receiver.pipeline import ReceiverOptions, receive
+from rxcli.receiver.receive import receive
 from rxcli.types import Frame
 
 #: Seeds whose pictures are large and striped enough to be taken for a screen.

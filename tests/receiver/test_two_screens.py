@@ -10,7 +10,7 @@ import pytest
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.pipeline import receive_frame
+from rxcli.receiver.receive import receive_frame
 from rxcli.results.record import from_record, to_record
 from rxcli.results.report import format_frame
 from rxcli.types import Frame, FrameResult

@@ -18,12 +18,13 @@ from rxcli.lab.simulate.isp import Isp, Tone
 from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.sensor import Sensor
+from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, load_profile, parse_profile
 from rxcli.receiver import camera as blind
-from rxcli.receiver import unknown_camera
-from rxcli.receiver.context import Failure, Timer
-from rxcli.receiver.pipeline import ReceiverOptions, receive
-from rxcli.receiver.search import Found, search
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.receive import receive
+from rxcli.receiver.search import Found, cameras, search
 from rxcli.types import Frame
 
 CORNERS = np.array([[LEFT, TOP], [RIGHT, TOP], [RIGHT, BOTTOM], [LEFT, BOTTOM]], float)
@@ -80,8 +81,8 @@ def _proposed(*rows_per_slot: float) -> list[blind.CameraHypothesis]:
 def _chosen(
     frame: Frame, proposed: Iterable[blind.CameraHypothesis], monkeypatch: pytest.MonkeyPatch
 ) -> Found | Failure:
-    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_, **__: list(proposed))
-    return search(frame, OPTIONS, Timer())
+    monkeypatch.setattr(cameras, "propose", lambda *_, **__: list(proposed))
+    return search(FrameCache(frame), OPTIONS)
 
 
 def test_packets_decide_between_hypotheses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,7 +106,7 @@ def test_without_packets_there_is_no_camera_but_a_reason(tmp_path: Path, monkeyp
 
 def test_a_period_that_is_somewhat_off_is_fitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, payloads = _frame(tmp_path)
-    monkeypatch.setattr(unknown_camera.blind, "propose", lambda *_, **__: _proposed(1.002 * ROWS_PER_SLOT))
+    monkeypatch.setattr(cameras, "propose", lambda *_, **__: _proposed(1.002 * ROWS_PER_SLOT))
     result = next(receive([frame], OPTIONS))
     found, sd = result.estimated["rows_per_slot"]
     assert abs(found - ROWS_PER_SLOT) < 4 * sd < 0.01 * ROWS_PER_SLOT

@@ -20,8 +20,10 @@ from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.receiver.channel.known_picture import ColumnLight, KnownPicture, Observation
 from rxcli.receiver.clip.settings import SETTINGS
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.result import Received
 from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
-from rxcli.receiver.pipeline import receive, receive_frame
+from rxcli.receiver.receive import receive, receive_frame
 from rxcli.receiver.sync.tracking import BurstPhase, LinkTime
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Clock, Float32Array, Frame, FrameResult
@@ -227,11 +229,11 @@ def test_products_take_one_thread_while_a_photograph_is_received(monkeypatch: py
     blas = _controlled_blas(monkeypatch)
     inside: list[int] = []
 
-    def received(frame: Frame, *_: object) -> FrameResult:
+    def received(cache: FrameCache, *_: object) -> Received:
         inside.extend(library["num_threads"] for library in blas.info() if _is_numpys(library))
-        return FrameResult(frame.source, 0, 0.0, "no_screen")
+        return Received(FrameResult(cache.frame.source, 0, 0.0, "no_screen"), {})
 
-    monkeypatch.setattr("rxcli.receiver.pipeline._receive_still", received)
+    monkeypatch.setattr("rxcli.receiver.receive._receive_still", received)
     with blas.limit(limits=2, user_api="blas"):
         receive_frame(Frame(np.zeros((8, 8), np.uint8), "dark"), ReceiverOptions())
     assert inside

@@ -10,7 +10,7 @@ import pytest
 from rxcli.lab.simulate.capture import prepare
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.options import receiver_options
-from rxcli.receiver.pipeline import receive_frame
+from rxcli.receiver.receive import receive_frame
 from rxcli.results.aim import Aim, light_of
 from rxcli.types import Frame
 

@@ -13,8 +13,8 @@ from rxcli.errors import OutputError
 from rxcli.lab.benchmark.trial import Trial, frame_of
 from rxcli.lab.simulate.capture import prepare
 from rxcli.protocol import hex_to_bits, indices_to_bits
-from rxcli.receiver.pipeline import receive
-from rxcli.results.dump import dump_stages
+from rxcli.receiver.receive import receive
+from rxcli.results.dump import dump_stages, taps_writer
 from rxcli.types import FrameResult
 
 
@@ -25,7 +25,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[FrameResu
     take = prepare(replace(scene("clip", "sky"), n_frames=5), 1)
     trials = [Trial(take.frame(number, threads=1), number) for number in range(5)]
     frames = [replace(frame_of(t.capture, n), source="a clip.mp4", time_s=n / 30) for n, t in enumerate(trials)]
-    return folder, list(receive(frames, trials[0].options(dump_dir=folder)))
+    return folder, list(receive(frames, trials[0].options(), taps_writer(folder)))
 
 
 def taps_of(folder: Path, frame: int) -> dict[str, np.ndarray]:

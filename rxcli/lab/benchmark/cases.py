@@ -27,7 +27,7 @@ from rxcli.lab.simulate.files import write_dng, write_video
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.outputs import write_whole
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile
-from rxcli.receiver.pipeline import receive
+from rxcli.receiver.receive import receive
 from rxcli.results.truth import Scorer, Truth, truth_path
 from rxcli.runs.processes import ONE_THREAD, environment, peak_memory_mb, start_process
 from rxcli.types import FloatArray, Frame, FrameResult

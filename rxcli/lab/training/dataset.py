@@ -22,8 +22,8 @@ from rxcli.lab.training.scenes import SCENE_CLASSES, training_scene, validation_
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput, network_inputs, payload_observed
-from rxcli.receiver.context import Failure, Timer
-from rxcli.receiver.search import search
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.search import Found, search
 from rxcli.receiver.still import decode, doubtful_columns
 from rxcli.types import Clock, FloatArray
 
@@ -113,8 +113,8 @@ def _cached(make: Callable[[int], Sample | None], n: int, folder: Path, what: st
 def _simulated(simulated: SimulatedScene, seed: int) -> Sample | None:
     """One frame as a sample; None if the receiver finds no clock, a wrong one, or no doubtful column."""
     trial = simulate_trial(simulated, seed)
-    found = search(trial.frame, trial.options(), Timer())
-    if isinstance(found, Failure):
+    found = search(FrameCache(trial.frame), trial.options())
+    if not isinstance(found, Found):
         return None
     reception = decode(found.best.acquisition, trial.options().skip, found.best.reception)
     scene, columns = reception.scene, doubtful_columns(reception)

@@ -18,7 +18,7 @@ import tomllib
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -64,20 +64,6 @@ class DenoiserInput:
     #: (C,) most likely weight.
     w: NDArray[np.int64]
     model: ObservationModel
-
-
-class Denoiser(Protocol):
-    """Interface of a model that corrects slot log-likelihood ratios."""
-
-    @property
-    def name(self) -> str:
-        """Name for reports."""
-
-    def slot_corrections(self, scene: DenoiserInput, columns: NDArray[np.int64]) -> Float32Array:
-        """(len(columns), N) values to add to ln p(light | lit) - ln p(light | dark) of every slot of `columns`.
-
-        The scene must have passed `remove_row_noise`.
-        """
 
 
 def remove_row_noise(scene: DenoiserInput) -> DenoiserInput:

@@ -1,4 +1,4 @@
-"""Clips: what one frame teaches is used on the next. The stages are those of `rxcli.receiver.pipeline`.
+"""Clips: what one frame teaches is used on the next. The stages are those of `rxcli.receiver.receive`.
 
 `receiver` has the three states and the step from frame to frame. The first frames agree on an outline (`acquiring`)
 and, where each shows little, on a clock (`common_clock`); the camera is known or estimated (`camera`). From then on

@@ -16,7 +16,8 @@ from rxcli.receiver.clip.camera import ClipCamera, Located
 from rxcli.receiver.clip.common_clock import shows_little
 from rxcli.receiver.clip.scene import followed_outline
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.context import Failure, Timer
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.screen.registration import ScreenTexture
 from rxcli.types import FloatArray, Frame
 
@@ -36,10 +37,10 @@ class FirstFrames:
     @classmethod
     def begin(cls, frame: Frame, camera: ClipCamera) -> FirstFrames | Failure:
         """Search the first frame."""
-        located = camera.locate(frame, Timer())
+        located = camera.locate(FrameCache(frame))
         if isinstance(located, Failure):
             return located
-        corners = located.context.corners
+        corners = located.context.sampled_corners
         texture = None if camera.options.corners is not None else ScreenTexture(frame, corners, None)
         return cls((frame,), located, texture, (np.zeros_like(corners),))
 
@@ -64,14 +65,14 @@ class FirstFrames:
 
     def agreed(self) -> Located:
         """The first frame with the outline on which all of them agree."""
-        return self.located.moved_to(self.located.context.corners + np.median(self.differences, axis=0))
+        return self.located.moved_to(self.located.context.sampled_corners + np.median(self.differences, axis=0))
 
     def with_frame(self, frame: Frame, camera: ClipCamera) -> FirstFrames:
         """These frames and one more; it is searched for its outline and its camera as far as they are unsure."""
         longer, located, found = replace(self, frames=(*self.frames, frame)), self.located, None
         unsure = located.camera_error == np.inf or (located.camera_error > 0 and self.shows_little)
         if unsure or not (self._agree or located.is_plain):
-            found = (camera if unsure else replace(camera, context=located.context)).locate(frame, Timer())
+            found = (camera if unsure else replace(camera, context=located.context)).locate(FrameCache(frame))
             longer = replace(longer, located=located.with_surer_camera(found) if unsure else located)
         return longer if self._agree else longer._compared(frame, found)
 
@@ -81,12 +82,12 @@ class FirstFrames:
         context = self.located.context
         moved = self.texture.find(frame)
         if not moved.is_precise:
-            moved = replace(moved, corners=context.corners)
+            moved = replace(moved, corners=context.sampled_corners)
         if found is None:
             corners = followed_outline(frame, moved.corners + self.differences[-1], context.screens[0])
         else:
             corners = None if found.outline is None else found.outline.corners
-        reach = float(np.ptp(context.corners[:, 0])) / 2
+        reach = float(np.ptp(context.sampled_corners[:, 0])) / 2
         if corners is None or not moved.fits or np.abs(corners - moved.corners).max() > reach:
             return replace(self, texture=None)
         self.texture.learn(frame, moved)

@@ -13,8 +13,8 @@ from rxcli.receiver import channel
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View
 from rxcli.receiver.decode import assemble, confidence, detect
+from rxcli.receiver.frame.settings import SETTINGS as pass_settings
 from rxcli.receiver.light import slot_llr
-from rxcli.receiver.settings import SETTINGS as receiver_settings
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, IntArray
 
 
@@ -45,7 +45,7 @@ class Burst:
     def posteriors(self) -> BurstPosteriors:
         """Of this burst alone."""
         metrics = self.metrics[None]
-        return detect.detect(metrics, detect.plausible_weights(metrics, receiver_settings.weight_margin, self._llr))
+        return detect.detect(metrics, detect.plausible_weights(metrics, pass_settings.weight_margin, self._llr))
 
     @cached_property
     def _llr(self) -> Float32Array:

@@ -7,11 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.clip.common_clock import Start, acquisition_at
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
-from rxcli.receiver.reception import Reception
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.context import FrameContext
+from rxcli.receiver.frame.passes import Reception
+from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.settings import SETTINGS as search_settings
 from rxcli.receiver.still import initial_pass
@@ -47,13 +50,14 @@ class Located:
 
     def moved_to(self, corners: FloatArray) -> Located:
         """The same with the screen at the corners (4, 2)."""
-        return Located(replace(self.outline, corners=corners), replace(self.context, corners=corners), None)
+        return Located(replace(self.outline, corners=corners), replace(self.context, sampled_corners=corners), None)
 
     def with_surer_camera(self, located: Located | Failure) -> Located:
         """The same with the camera of another frame, if that camera is more precise."""
         if isinstance(located, Failure) or located.camera_error >= self.camera_error:
             return self
-        context = replace(located.context, frame=self.context.frame, corners=self.context.corners)
+        own = self.context
+        context = replace(located.context, cache=own.cache, sampled_corners=own.sampled_corners)
         return Located(self.outline, context, None)
 
 
@@ -85,38 +89,42 @@ class ClipCamera:
         """What is known of the camera of another frame: nothing where it is of another kind."""
         return self if self.fits(frame) and "tracking" in self.options.skip else replace(self, context=None)
 
-    def locate(self, frame: Frame, timer: Timer) -> Located | Failure:
+    def locate(self, cache: FrameCache) -> Located | Failure:
         """Find the screen in a frame, and the camera where it is not known; a failure where there is none."""
-        found = search(frame, self.options, timer, self.context)
+        found = search(cache, self.options, self.context)
         context = found.best.context if isinstance(found, Found) else found.context or self.context
         if found.outline is None or context is None:
             assert isinstance(found, Failure)
             return found
-        return Located(found.outline, replace(context, frame=frame, corners=found.outline.corners), found)
+        return Located(found.outline, replace(context, cache=cache, sampled_corners=found.outline.corners), found)
 
-    def acquire(self, located: Located, start: Start | None, timer: Timer) -> tuple[ClipCamera, Acquired | Failure]:
+    def acquire(
+        self, located: Located, start: Start | None, cache: FrameCache
+    ) -> tuple[ClipCamera, Acquired | Failure]:
         """Find the clock of a frame; its camera is known from then on.
 
         Args:
             located: the frame.
             start: the clock that the first frames agreed on, if any.
-            timer: of the frame.
+            cache: of the frame.
         """
-        frame, corners = located.context.frame, located.context.corners
-        context = replace(self.context or located.context, frame=frame, corners=corners, timer=timer)
+        corners = located.context.sampled_corners
+        context = replace(self.context or located.context, cache=cache, sampled_corners=corners)
         camera = replace(self, context=context)
         predicted = None if start is None else acquisition_at(start, context)
         if predicted is not None:
             return camera, Acquired(context, predicted, initial_pass(predicted))
         at = replace(self.options, corners=corners)
-        found = located.found or search(frame, at, timer, context)
+        found = located.found or search(cache, at, context)
         if isinstance(found, Failure):
             return camera, found
         if not self.is_compared:
             camera, found = camera._compared(found, at)
         best = found.best
         if best.context.camera.hypothesis is not None:
-            context = replace(best.context, camera=replace(best.context.camera, hypothesis=None), corners=corners)
+            context = replace(
+                best.context, camera=replace(best.context.camera, hypothesis=None), sampled_corners=corners
+            )
         return replace(camera, context=context), Acquired(context, best.acquisition, best.reception)
 
     def _compared(self, found: Found, at: ReceiverOptions) -> tuple[ClipCamera, Found]:
@@ -129,7 +137,7 @@ class ClipCamera:
         if best.context.camera.profile is None or enough >= search_settings.plain:
             return compared, found
         context = best.context
-        estimated = search(context.frame, replace(at, cameras=(), force_camera=False), context.timer)
+        estimated = search(context.cache, replace(at, cameras=(), force_camera=False))
         if isinstance(estimated, Failure) or estimated.best.evidence < max(search_settings.few_packets, enough):
             return compared, found
         stretch = context.camera.line_delay_s / estimated.best.context.camera.line_delay_s

@@ -13,9 +13,10 @@ import numpy as np
 
 from rxcli.numerics import folded
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.acquisition import Acquisition, distinct_screens, noise_of, sample_columns, variants_of
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.context import FrameContext
+from rxcli.receiver.frame.acquisition import Acquisition, distinct_screens, noise_of, variants_of
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.receiver.sync.tracking import LinkTime
@@ -36,7 +37,7 @@ class Start:
 
 def shows_little(context: FrameContext) -> bool:
     """Whether a frame shows too few packets to find its clock alone."""
-    corners, height = context.corners, context.frame.height
+    corners, height = context.sampled_corners, context.frame.height
     shown = min(float(corners[:, 1].max()), height - 1.0) - max(float(corners[:, 1].min()), 0.0)
     shortest_s = min(screen.packet_s for screen in context.screens)
     return shown * context.camera.line_delay_s < SETTINGS.few_packets * shortest_s
@@ -88,7 +89,8 @@ def _starts(frames: Sequence[Frame], context: FrameContext) -> Iterator[Start]:
     period_s = float(np.polyfit(numbers - numbers[0], times_s, 1)[0])
     starts = (numbers - numbers[0]) * period_s / line_delay_s
     for screen in distinct_screens(context.screens):
-        profiles = [sample_columns(replace(context, frame=frame), screen.columns) for frame in frames]
+        each = (replace(context, cache=FrameCache(frame, context.timer)) for frame in frames)
+        profiles = [of_frame.sample_columns(screen.columns) for of_frame in each]
         joined = _one_after_the_other(profiles, starts, screen.packet_s / line_delay_s)
         slot, lead = _first_header(joined, screen, 1 / (screen.slot_rate_hz * line_delay_s))
         time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
@@ -139,7 +141,7 @@ def _one_after_the_other(profiles: Sequence[RowProfiles], starts: FloatArray, pa
 def acquisition_at(start: Start, context: FrameContext) -> Acquisition | None:
     """What the clip's clock predicts for a frame; None where nothing of the screen is in the picture."""
     screen, frame, camera = start.screen, context.frame, context.camera
-    profiles = sample_columns(context, screen.columns)
+    profiles = context.sample_columns(screen.columns)
     top, bottom = sync.row_span(profiles)
     if top == bottom:
         return None

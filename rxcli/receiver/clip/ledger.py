@@ -11,12 +11,12 @@ from rxcli.options import ReceiverOptions
 from rxcli.receiver.clip.bursts import Burst, bursts_of, doubts, lit_slots
 from rxcli.receiver.clip.common_clock import Start
 from rxcli.receiver.clip.link import Link
-from rxcli.receiver.clip.reporting import completed
+from rxcli.receiver.clip.reporting import Reporter
 from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.sync import tracking
-from rxcli.types import Frame, FrameResult
+from rxcli.types import Frame, FrameResult, OnTaps
 
 _SLOW_MOTION = "slow motion: time stamps are {:g} times as long as the link's time, which was taken"
 _RETIMED = (
@@ -34,10 +34,11 @@ class Ledger:
 
     Args:
         options: of the receiver.
+        on_taps: is given the arrays of every received frame, or None.
     """
 
-    def __init__(self, options: ReceiverOptions) -> None:
-        self._options = options
+    def __init__(self, options: ReceiverOptions, on_taps: OnTaps | None) -> None:
+        self._options, self._reporter = options, Reporter(options, on_taps)
         #: Frames without a result, oldest first; all that were received belong to the link's present time.
         self._waiting: deque[Waiting] = deque()
         #: Bursts that are still going on, by number.
@@ -219,4 +220,4 @@ class Ledger:
         for burst in closed:
             del self._bursts[burst.number]
         going_on = [burst for burst in own if burst.number in shown]
-        return completed(waiting, self._link, closed, going_on, self._options, self.certainty)
+        return self._reporter.completed(waiting, self._link, closed, going_on, self.certainty)

@@ -22,22 +22,25 @@ from rxcli.receiver.clip.ledger import Ledger
 from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View, Waiting
-from rxcli.receiver.context import Failure, Timer
 from rxcli.receiver.decode import assemble
-from rxcli.receiver.reception import Reception, shows_steady_light
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.passes import Reception, shows_steady_light
+from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode
 from rxcli.receiver.sync import tracking
-from rxcli.types import FloatArray, Frame, FrameResult
+from rxcli.types import FloatArray, Frame, FrameResult, OnTaps
 
 _SAME = "it shows the frame before once more, so that its time is not that of its rows; it was left out"
 _NOTHING_LIT = "no light of the screen's columns is seen; something may be in front of it"
 _NOMINAL_TIME = "the clip's time stamps do not advance here; its nominal frame rate was taken"
 
 
-def receive_clip(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
+def receive_clip(
+    frames: Iterable[Frame], options: ReceiverOptions, on_taps: OnTaps | None = None
+) -> Iterator[FrameResult]:
     """Receive the frames of a clip; results come a frame or more late. An error of `frames` comes after all results."""
-    state = begin(options)
+    state = begin(options, on_taps)
     try:
         for frame in frames:
             with one_blas_thread():
@@ -89,9 +92,9 @@ State = Acquiring | Tracking | Lost
 _Step = tuple[Tracking | Lost, list[FrameResult]]
 
 
-def begin(options: ReceiverOptions) -> State:
+def begin(options: ReceiverOptions, on_taps: OnTaps | None = None) -> State:
     """The state before the first frame."""
-    known = Known(Ledger(options), ClipCamera(options))
+    known = Known(Ledger(options, on_taps), ClipCamera(options))
     return Acquiring(known) if "tracking" in options.skip else Lost(known)
 
 
@@ -141,7 +144,7 @@ def _receive_first(known: Known, held: FirstFrames) -> _Step:
 
 def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | None = None) -> _Step:
     """Receive a frame by what is known, or like a photograph where that does not fit; `located` where it is."""
-    timer, ledger, before = Timer(), state.known.ledger, state.known.frame
+    cache, ledger, before = FrameCache(frame), state.known.ledger, state.known.frame
     message = _NOMINAL_TIME if frame.nominal_time else ledger.message
     waiting = Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok", message=message))
     reason = _reason_to_skip(state, frame, before)
@@ -152,15 +155,15 @@ def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | 
         return state, ledger.add(waiting)
     view: View | Failure | None = None
     if isinstance(state, Tracking) and state.known.camera.fits(frame):
-        view = state.scene.view(frame, ledger.time, timer)
+        view = state.scene.view(cache, ledger.time)
     if isinstance(state, Tracking) and view is not None:
         waiting.update(skipped={"tracking": 1})
         state = replace(state, known=replace(state.known, corners=state.scene.corners))
     else:
-        state, view, report = _receive_anew(state.known, frame, located, timer)
+        state, view, report = _receive_anew(state.known, cache, located)
         waiting.update(denoiser=report)
     if isinstance(view, Failure):
-        waiting.update(status=view.status, message=view.message, timing_ms=timer.total())
+        waiting.update(status=view.status, message=view.message, timing_ms=cache.timer.total())
         return state, ledger.add(waiting, scene_ends=True)
     waiting.update(
         **view.context.camera.result_fields,
@@ -169,7 +172,7 @@ def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | 
         corners=state.known.corners,
     )
     results = ledger.enter(waiting, view, state.scene if isinstance(state, Tracking) else None)
-    waiting.update(timing_ms=timer.total())
+    waiting.update(timing_ms=cache.timer.total())
     return state, results
 
 
@@ -207,19 +210,20 @@ def _is_doubled(frame: Frame, before: Frame, corners: FloatArray | None) -> bool
 
 
 def _receive_anew(
-    known: Known, frame: Frame, located: Located | Failure | None, timer: Timer
+    known: Known, cache: FrameCache, located: Located | Failure | None
 ) -> tuple[Tracking | Lost, View | Failure, dict[str, Any] | None]:
     """Receive a frame like a photograph, only the camera taken from before.
 
     Returns:
         The state after it, its view, and what the auto-encoder reports.
     """
-    ledger, camera = known.ledger, known.camera.of_frame(frame)
-    located = located or camera.locate(frame, timer)
+    frame, timer, ledger = cache.frame, cache.timer, known.ledger
+    camera = known.camera.of_frame(frame)
+    located = located or camera.locate(cache)
     if isinstance(located, Failure):
         return Lost(replace(known, camera=camera)), located, None
     ledger.certainty = located.outline.certainty
-    camera, acquired = camera.acquire(located, ledger.start, timer)
+    camera, acquired = camera.acquire(located, ledger.start, cache)
     known = replace(known, camera=camera, corners=located.outline.corners)
     if isinstance(acquired, Failure):
         return Lost(known), acquired, None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,54 +15,55 @@ from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.confidence import BurstInClip
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
-from rxcli.results.dump import dump_stages
-from rxcli.types import BELIEVABLE, FrameResult, IntArray
+from rxcli.types import BELIEVABLE, FrameResult, IntArray, OnTaps
 
 
-def completed(
-    waiting: Waiting,
-    link: Link,
-    closed: Sequence[Burst],
-    going_on: Sequence[Burst],
-    options: ReceiverOptions,
-    certainty: float,
-) -> FrameResult:
-    """The result of a received frame.
+@dataclass(frozen=True, slots=True)
+class Reporter:
+    """Writes the results of frames."""
 
-    Args:
-        waiting: the frame.
-        link: that numbered its bursts.
-        closed: its bursts that no later frame shows.
-        going_on: its other bursts.
-        options: of the receiver.
-        certainty: probability that the screen's columns are numbered right.
-    """
-    result, view = waiting.result, waiting.view
-    assert view is not None
-    ended = [burst.ended(view) for burst in closed]
-    columns = assemble.clip_results(
-        view.bursts.clock,
-        ended,
-        lambda column: any(burst.probability(column) >= BELIEVABLE for burst in going_on),
-        view.snr,
-        link.headerless(ended, len(view.snr)),
-        options.min_confidence,
-        certainty,
-    )
-    if view.denoised:
-        columns = tuple(replace(column, denoised=column.column in view.denoised) for column in columns)
-    if view.context.camera.reversed:
-        columns = tuple(assemble.in_stored_rows(column, view.height) for column in columns)
-    if options.dump_dir is not None:
-        dump_stages(options.dump_dir, result.source, result.frame, _taps(result, view, ended))
-    soft = None
-    if options.soft_bits:
-        soft = clip_soft_bits(ended, assemble.snr_db_of_columns(view.snr), link.epoch)
-    if soft is not None:
-        soft = replace(soft, source=result.source, frame=result.frame, time_s=result.time_s)
-    name = view.acquisition.variant(link.phase.repeats).name
-    status = assemble.clip_status(columns)
-    return replace(result, columns=columns, status=status, screen_profile=name, soft_bits=soft)
+    options: ReceiverOptions
+    #: Is given the arrays of every received frame.
+    on_taps: OnTaps | None
+
+    def completed(
+        self, waiting: Waiting, link: Link, closed: Sequence[Burst], going_on: Sequence[Burst], certainty: float
+    ) -> FrameResult:
+        """The result of a received frame.
+
+        Args:
+            waiting: the frame.
+            link: that numbered its bursts.
+            closed: its bursts that no later frame shows.
+            going_on: its other bursts.
+            certainty: probability that the screen's columns are numbered right.
+        """
+        result, view = waiting.result, waiting.view
+        assert view is not None
+        ended = [burst.ended(view) for burst in closed]
+        columns = assemble.clip_results(
+            view.bursts.clock,
+            ended,
+            lambda column: any(burst.probability(column) >= BELIEVABLE for burst in going_on),
+            view.snr,
+            link.headerless(ended, len(view.snr)),
+            self.options.min_confidence,
+            certainty,
+        )
+        if view.denoised:
+            columns = tuple(replace(column, denoised=column.column in view.denoised) for column in columns)
+        if view.context.camera.reversed:
+            columns = tuple(assemble.in_stored_rows(column, view.height) for column in columns)
+        if self.on_taps is not None:
+            self.on_taps(result.source, result.frame, _taps(result, view, ended))
+        soft = None
+        if self.options.soft_bits:
+            soft = clip_soft_bits(ended, assemble.snr_db_of_columns(view.snr), link.epoch)
+        if soft is not None:
+            soft = replace(soft, source=result.source, frame=result.frame, time_s=result.time_s)
+        name = view.acquisition.variant(link.phase.repeats).name
+        status = assemble.clip_status(columns)
+        return replace(result, columns=columns, status=status, screen_profile=name, soft_bits=soft)
 
 
 def _taps(result: FrameResult, view: View, ended: Sequence[BurstInClip]) -> dict[str, Any]:

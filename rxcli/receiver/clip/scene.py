@@ -11,12 +11,13 @@ import numpy as np
 from rxcli.numerics import TINY
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import plane
-from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.channel import SlotLikelihoods, known_picture
 from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import Pose, View
-from rxcli.receiver.context import FrameContext, Timer
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.light import MIN_VARIANCE, Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.screen import geometry
@@ -36,7 +37,7 @@ class TrackedScreen:
     """
 
     def __init__(self, context: FrameContext, acquisition: Acquisition, black_level: float, named: bool) -> None:
-        frame, corners, tone = context.frame, context.corners, context.camera.tone
+        frame, corners, tone = context.frame, context.sampled_corners, context.camera.tone
         self._lens, self._named, self._acquisition = context.camera.lens, named, acquisition
         self._black_level = black_level
         column_px = float(np.linalg.norm(corners[1] - corners[0])) / acquisition.screen.columns
@@ -71,31 +72,30 @@ class TrackedScreen:
 
     # -- a frame -------------------------------------------------------------------------------------------------------
 
-    def view(self, frame: Frame, time: tracking.LinkTime, timer: Timer) -> View | None:
+    def view(self, cache: FrameCache, time: tracking.LinkTime) -> View | None:
         """Receive a frame by what is known; None where that does not fit.
 
         A screen at rest is searched now and then: if it had moved, the picture would fit worse.
 
         Args:
-            frame: taken with the same camera as those before.
+            cache: taken with the same camera as those before.
             time: the link's time.
-            timer: time is counted there.
         """
         if self.last is None:
             return None
         self._n_unlooked += 1
         rests = self._n_rested >= SETTINGS.still_looks and self._n_updates >= SETTINGS.first_updates
         if rests and self._n_unlooked < SETTINGS.look_every:
-            view = self._view(frame, self.last, time, SETTINGS.rest_misfit, timer)
+            view = self._view(cache, self.last, time, SETTINGS.rest_misfit)
             if view is not None:
                 return view
-        with timer("geometry"):
-            is_followed = self._follow(frame)
-        return self._view(frame, self.last, time, SETTINGS.misfit, timer) if is_followed else None
+        with cache.timer("geometry"):
+            is_followed = self._follow(cache.frame)
+        return self._view(cache, self.last, time, SETTINGS.misfit) if is_followed else None
 
-    def _view(self, frame: Frame, last: View, time: tracking.LinkTime, max_misfit: float, timer: Timer) -> View | None:
+    def _view(self, cache: FrameCache, last: View, time: tracking.LinkTime, max_misfit: float) -> View | None:
         """Receive a frame with the screen at its current pose."""
-        pose = self.pose
+        pose, frame, timer = self.pose, cache.frame, cache.timer
         with timer("sampling"):
             light, picture = self._scaled(self.strips(frame)), self._placed(pose)
             columns = picture.solve(light)
@@ -111,7 +111,7 @@ class TrackedScreen:
             columns, clock, likelihoods = measured
             shown = _shown(pose.map.inside, known_picture.row_positions(pose.rows, clock), clock)
         return View(
-            replace(last.context, frame=frame, corners=self.corners, timer=timer),
+            replace(last.context, cache=cache, sampled_corners=self.corners),
             replace(last.acquisition, clock=clock),
             tracking.FrameBursts(frame.index, 0, clock, likelihoods.metrics, shown, tracked=True),
             last.isi_memory,

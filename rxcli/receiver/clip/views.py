@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.channel.known_picture import ColumnLight
-from rxcli.receiver.context import FrameContext
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.sync.tracking import FrameBursts
 from rxcli.types import Float32Array, FloatArray, FrameResult, IntArray

@@ -2,6 +2,5 @@
 
 from rxcli.receiver.plane.read import read_plane, turned
 from rxcli.receiver.plane.rows import sample_rows, strips_per_column, tone_to_light
-from rxcli.receiver.plane.store import PlaneStore
 
-__all__ = ["PlaneStore", "read_plane", "sample_rows", "strips_per_column", "tone_to_light", "turned"]
+__all__ = ["read_plane", "sample_rows", "strips_per_column", "tone_to_light", "turned"]

@@ -19,6 +19,7 @@ from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import find_combs, grid_of_comb
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
 from rxcli.receiver.screen.numbering import LightProfile, centred, first_columns, light_profile
+from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.strips import Strips, read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
@@ -66,32 +67,9 @@ class ColumnLayout:
         return self.n_columns >= _NARROW_COLUMNS
 
 
-@dataclass(frozen=True, slots=True)
-class OutlineCandidate:
-    """A candidate position of the screen."""
-
-    #: (4, 2) pixels of the stored picture, clockwise from the screen's top left there.
-    corners: FloatArray
-    #: Strips of the picture on which it was found.
-    strips: Strips
-    #: Columns are numbered from the screen's first.
-    grid: Grid
-    layout: ColumnLayout
-    #: Log-odds of its first column and number of columns relative to the likeliest.
-    log_odds: float
-    #: Candidates of one family differ only in the first column.
-    family: int
-    #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
-    fills: bool
-    #: Sides of the stored picture at which no light shows.
-    unlit_sides: tuple[str, ...]
-    #: Whether the columns' borders stand out by more than chance.
-    stands_out: bool
-
-
 def find_screens(
     plane: LightPlane, layouts: Sequence[ColumnLayout], lens: Lens | None = None, bright: FloatArray | None = None
-) -> list[list[OutlineCandidate]]:
+) -> list[list[Outline]]:
     """Candidate outlines of each screen in a picture, likeliest first; the clearest screen comes first.
 
     Args:
@@ -136,7 +114,7 @@ def _strips_of(plane: LightPlane, lens: Lens | None) -> Strips | None:
     return strips if strips.lit.shape[1] >= _MIN_STRIPS else None
 
 
-def _screens_apart(strips: Strips, layouts: Sequence[ColumnLayout]) -> list[list[OutlineCandidate]]:
+def _screens_apart(strips: Strips, layouts: Sequence[ColumnLayout]) -> list[list[Outline]]:
     """Candidate outlines of two screens side by side, or none: together they light more columns than one has."""
     sides = strips.sides_of_gap()
     found = [(side, grid) for side in sides for grid in wide_grids(side, layouts[0].sigma)[:1]]
@@ -257,11 +235,11 @@ def _stands_out(strips: Strips, grid: Grid, least: float = 1.0) -> bool:
     return bool(grid.contrast > least * by_chance)
 
 
-def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout], rank: int = 0) -> list[OutlineCandidate]:
+def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout], rank: int = 0) -> list[Outline]:
     """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
     light, profile = _light_across(strips, grid, layouts[0].sigma)
     stands_out = _stands_out(strips, grid)
-    found: list[OutlineCandidate] = []
+    found: list[Outline] = []
     for family, layout in enumerate(layouts, rank * len(layouts)):
         columns, odds, fills = first_columns(profile, layout.n_columns)
         best, n = int(columns[odds.argmax()]), layout.n_columns
@@ -275,7 +253,17 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout], rank:
                 unlit = (profile.ends[0] - number, number + n - profile.ends[1])
                 sides = _unlit_sides(corners, unlit, has_bars, (strips.width, strips.height))
                 found.append(
-                    OutlineCandidate(corners, strips, counted, layout, log_odds, family, fills, sides, stands_out)
+                    Outline(
+                        corners,
+                        inferred=sides,
+                        log_odds=log_odds,
+                        family=family,
+                        fills=fills,
+                        stands_out=stands_out,
+                        n_columns=n,
+                        strips=strips,
+                        grid=counted,
+                    )
                 )
     likeliest = max(candidate.log_odds for candidate in found)
     found = [replace(candidate, log_odds=candidate.log_odds - likeliest + rank * _SECOND) for candidate in found]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.receiver.reception import Reception
+from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.search.hypothesis import Scored
 from rxcli.receiver.search.settings import SETTINGS
 

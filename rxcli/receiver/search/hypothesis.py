@@ -6,9 +6,11 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.acquisition import Acquisition
-from rxcli.receiver.context import Camera, FrameContext, Outline
-from rxcli.receiver.reception import Reception
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.camera import FrameCamera
+from rxcli.receiver.frame.context import FrameContext
+from rxcli.receiver.frame.passes import Reception
+from rxcli.receiver.screen.outline import Outline
 from rxcli.types import Clock, RowProfiles, SearchStep
 
 
@@ -17,7 +19,7 @@ class Hypothesis:
     """A hypothesis about a picture. Its clock is found, and its columns are read, only before its initial pass."""
 
     outline: Outline
-    camera: Camera
+    camera: FrameCamera
     screen: ScreenProfile
     #: The screen and others that differ only in the number of copies per burst, largest number first.
     variants: tuple[ScreenProfile, ...]
@@ -52,7 +54,7 @@ class Scored:
     #: Tempered evidence plus log prior: the larger wins.
     score: float
 
-    def with_camera(self, camera: Camera) -> Self:
+    def with_camera(self, camera: FrameCamera) -> Self:
         """The same with another camera."""
         return replace(self, context=replace(self.context, camera=camera))
 

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from rxcli.receiver.acquisition import Acquisition, sample_columns
-from rxcli.receiver.context import Outline
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search.hypothesis import Scored
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
@@ -41,7 +41,7 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
             continue
         nearest = min(rivals, key=lambda index: abs(shifts[index]))
         moved = replace(best.hypothesis, outline=outlines[nearest], camera=best.context.camera)
-        profiles, n = sample_columns(proposer.context(moved), n_columns), shifts[nearest]
+        profiles, n = proposer.context(moved).sample_columns(n_columns), shifts[nearest]
         reread = replace(acquisition, profiles=profiles)
         gain = _outer_evidence(reread, -n) - _outer_evidence(acquisition, n)
         for index in rivals:

@@ -9,14 +9,17 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.acquisition import noise_of, sample_columns, variants_of
-from rxcli.receiver.cameras import known_camera
-from rxcli.receiver.context import Camera, Failure, FrameContext, Outline, Timer
+from rxcli.receiver.frame.acquisition import noise_of, variants_of
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.camera import FrameCamera
+from rxcli.receiver.frame.context import FrameContext
+from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.screen.outline import Outline
+from rxcli.receiver.search.cameras import known_camera, propose_cameras, relabelled_camera
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
-from rxcli.receiver.unknown_camera import propose_cameras, relabelled_camera
-from rxcli.types import Clock, Frame, RowProfiles
+from rxcli.types import Clock, RowProfiles
 
 #: Number of columns on which a clock is sought first, or the nearest available number.
 _USUAL_COLUMNS = 20
@@ -27,16 +30,14 @@ class Proposer:
     """Proposes hypotheses about one frame.
 
     Attributes:
-        frame: the picture.
+        cache: the picture.
         options: screens and cameras.
-        timer: of the frame.
         outlines: that the screen may have.
         known: the camera and the screens, if known from other frames.
     """
 
-    frame: Frame
+    cache: FrameCache
     options: ReceiverOptions
-    timer: Timer
     outlines: tuple[Outline, ...]
     known: FrameContext | None = None
 
@@ -53,7 +54,7 @@ class Proposer:
 
         Rows are the same instants wherever the columns are, so the first family with any camera serves for all.
         """
-        known = self.known.camera if self.known else known_camera(self.frame, self.options)
+        known = self.known.camera if self.known else known_camera(self.cache.frame, self.options)
         if isinstance(known, Failure):
             return known
         if known is not None:
@@ -62,7 +63,7 @@ class Proposer:
         failure, n_proposed = None, 0
         usual = _nearest(self.options.screens, _USUAL_COLUMNS).columns
         for outline in self.families():
-            cameras = propose_cameras(self.frame, outline.corners, self.options, self.timer, usual)
+            cameras = propose_cameras(self.cache, outline.corners, self.options, usual)
             try:
                 while True:
                     if hypotheses := self._of_camera(next(cameras), -SETTINGS.next_camera * n_proposed):
@@ -74,7 +75,7 @@ class Proposer:
                 break
         return failure
 
-    def _of_camera(self, camera: Camera, log_prior: float) -> list[Hypothesis]:
+    def _of_camera(self, camera: FrameCamera, log_prior: float) -> list[Hypothesis]:
         """Hypotheses of one camera: a screen for every outline and clock."""
         screens, out = self._screens(), []
         if camera.hypothesis is not None:
@@ -88,9 +89,9 @@ class Proposer:
     def _screens(self) -> tuple[ScreenProfile, ...]:
         return self.known.screens if self.known else self.options.screens
 
-    def _hypothesis(self, outline: Outline, camera: Camera, screen: ScreenProfile, log_prior: float) -> Hypothesis:
+    def _hypothesis(self, outline: Outline, camera: FrameCamera, screen: ScreenProfile, log_prior: float) -> Hypothesis:
         variants = variants_of(screen, self.options.screens)
-        camera = relabelled_camera(camera, screen, self.frame)
+        camera = relabelled_camera(camera, screen, self.cache.frame)
         return Hypothesis(outline, camera, variants[0], variants, log_prior)
 
     def context(self, hypothesis: Hypothesis) -> FrameContext:
@@ -105,12 +106,12 @@ class Proposer:
                 for screen in screens
                 if (screen.slot_rate_hz, screen.packet_slots) == (own.slot_rate_hz, own.packet_slots)
             )
-        return FrameContext(self.frame, hypothesis.outline.corners, camera, screens, self.timer)
+        return FrameContext(self.cache, hypothesis.outline.corners, camera, screens)
 
     def with_clock(self, hypothesis: Hypothesis) -> Hypothesis | None:
         """The hypothesis with its columns and its clock, or None if no header is found."""
-        profiles = sample_columns(self.context(hypothesis), hypothesis.screen.columns)
-        with self.timer("clock"):
+        profiles = self.context(hypothesis).sample_columns(hypothesis.screen.columns)
+        with self.cache.timer("clock"):
             clock = _clock(hypothesis, profiles)
         if clock is None or clock.header_peak_ratio < SETTINGS.min_lead:
             return None
@@ -160,13 +161,13 @@ def _nearest(screens: Iterable[ScreenProfile], n_columns: int) -> ScreenProfile:
     return min(screens, key=lambda screen: (abs(np.log(screen.columns / n_columns)), screen.columns))
 
 
-def _clock_of(screen: ScreenProfile, camera: Camera) -> tuple[float, int]:
+def _clock_of(screen: ScreenProfile, camera: FrameCamera) -> tuple[float, int]:
     """Key by which a picture distinguishes screens: packet slots, and with a known camera the slot rate."""
     return (0.0 if camera.hypothesis is not None else screen.slot_rate_hz), screen.packet_slots
 
 
 def _by_clock(
-    outline: Outline, camera: Camera, screens: Iterable[ScreenProfile]
+    outline: Outline, camera: FrameCamera, screens: Iterable[ScreenProfile]
 ) -> dict[tuple[float, int], list[ScreenProfile]]:
     """Screens with the columns of an outline by their clock; if that has no slot rate, only the fastest of them."""
     groups: dict[tuple[float, int], list[ScreenProfile]] = {}

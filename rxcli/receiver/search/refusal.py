@@ -10,16 +10,18 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS
-from rxcli.receiver.acquisition import noise_of, sample_columns
 from rxcli.receiver.camera.advice import NO_HEADERS
-from rxcli.receiver.context import Failure, FrameContext
-from rxcli.receiver.corners import too_small
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.steady import is_common_light, periodic_share
-from rxcli.receiver.reception import Reception, shows_steady_light
+from rxcli.receiver.frame.acquisition import noise_of
+from rxcli.receiver.frame.context import FrameContext
+from rxcli.receiver.frame.passes import Reception, shows_steady_light
+from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.frame.settings import SETTINGS as PASSES
 from rxcli.receiver.search.hypothesis import Hypothesis
+from rxcli.receiver.search.outlines import too_small
 from rxcli.receiver.search.propose import Proposer
-from rxcli.receiver.settings import SETTINGS
+from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import as_one_column
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import RowProfiles
@@ -46,7 +48,7 @@ def light_without_data(context: FrameContext, reception: Reception) -> Failure |
             return None
         joint = as_one_column(reception)
         no_header = bool(np.any(assemble.find_headerless(joint.posteriors.header_llr)))
-        if float(joint.column_llr.max()) > SETTINGS.min_packets_llr and not no_header:
+        if float(joint.column_llr.max()) > PASSES.min_packets_llr and not no_header:
             return None
         return Failure("no_signal", STEADY_LIGHT if shows_steady_light(reception) else _ONE_LAMP)
 
@@ -76,7 +78,7 @@ def why_no_packets(proposer: Proposer, nearest: Hypothesis | None, failure: Fail
     if nearest is None:
         return replace(failure or Failure("no_signal", NO_HEADERS), outline=proposer.families()[0])
     context = proposer.context(nearest)
-    profiles = sync.binned_strips(sample_columns(context, nearest.screen.columns))
+    profiles = sync.binned_strips(context.sample_columns(nearest.screen.columns))
     if is_switched(context, profiles):
         message = STEADY_LIGHT
     elif context.camera.hypothesis is not None:

@@ -9,21 +9,24 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.acquisition import Acquisition
 from rxcli.receiver.camera.settings import SETTINGS as camera_settings
-from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
-from rxcli.receiver.corners import proposed_screens
-from rxcli.receiver.reception import Reception
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.context import FrameContext
+from rxcli.receiver.frame.passes import Reception
+from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
+from rxcli.receiver.search.cameras import settle
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
 from rxcli.receiver.search.numbers import less_likely_outlines, numbered
+from rxcli.receiver.search.outlines import proposed_screens
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.refusal import light_without_data, why_no_packets
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import in_other_bursts, initial_pass
-from rxcli.receiver.unknown_camera import settle
-from rxcli.types import FloatArray, Frame
+from rxcli.types import FloatArray
 
 _Cameras = Generator[list[Hypothesis], None, Failure | None]
 #: Negative key, so that a heap returns the likeliest first; identity and a number order ties.
@@ -31,9 +34,8 @@ _Entry = tuple[float, tuple[object, ...], int, Hypothesis]
 
 
 def search(
-    frame: Frame,
+    cache: FrameCache,
     options: ReceiverOptions,
-    timer: Timer,
     known: FrameContext | None = None,
     *,
     outlines: list[Outline] | None = None,
@@ -42,19 +44,18 @@ def search(
     """Find outline, rows, camera, screen, clock and bursts of a frame.
 
     Args:
-        frame: the picture.
+        cache: the picture.
         options: screens, cameras, and corners if given.
-        timer: of the frame.
         known: context of a frame of the same camera, if the camera and the screens are known.
         outlines: of the screen to receive; those of the clearest one in the picture if left out.
         budget: maximum number of initial passes.
     """
     if outlines is None:
-        screens = proposed_screens(frame, options, timer)
+        screens = proposed_screens(cache, options)
         if isinstance(screens, Failure):
             return screens
         outlines = screens[0]
-    proposer = Proposer(frame, options, timer, tuple(outlines), known)
+    proposer = Proposer(cache, options, tuple(outlines), known)
     walk = _Walk(proposer, budget if outlines[0].stands_out else SETTINGS.doubtful_budget)
     best = walk.run()
     min_evidence = SETTINGS.bail if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
@@ -214,7 +215,7 @@ class _Walk:
                 self._push(self._siblings, scored.score + sibling.log_prior - hypothesis.log_prior, sibling)
 
     def _measured(self, hypothesis: Hypothesis, acquisition: Acquisition) -> Scored:
-        with self._proposer.timer("detect"):
+        with self._proposer.cache.timer("detect"):
             return _rated(hypothesis, self._proposer.context(hypothesis), acquisition, initial_pass(acquisition))
 
 

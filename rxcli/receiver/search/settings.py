@@ -1,4 +1,4 @@
-"""Settings of the search: weight of evidence, end of the search, distance of rivals."""
+"""Settings of the search: outlines, weight of evidence, end of the search, distance of rivals, light without data."""
 
 from __future__ import annotations
 
@@ -43,6 +43,22 @@ class SearchSettings:
     may_be_log_odds: float = 3.0
     #: Weight of the log-likelihood of packets in outermost columns, as samples err together.
     outer_weight: float = 0.2
+
+    #: Minimum overlap of a given outline and the picture, as a fraction of either.
+    min_overlap: float = 0.002
+    #: Minimum number of rows for blind camera estimation.
+    min_rows: int = 24
+    #: Mean, as a share of white, below which a picture without a screen is reported as dark.
+    dark_mean: float = 0.08
+    #: Largest size of an outline relative to the picture, beyond which less than one column is visible.
+    largest_outline: float = 50.0
+
+    #: Largest shift of the light of one lamp between columns, slots: blinds may be slanted.
+    max_column_shift_slots: int = 10
+    #: Detection of switched light without a clock: smoothing and longest period, rows; minimum explained share.
+    smooth_rows: int = 2
+    max_period_rows: int = 100
+    switched_share: float = 0.7
 
 
 SETTINGS = SearchSettings()

@@ -21,12 +21,13 @@ from rxcli.protocol import HEADER, bits_per_symbol, codebook, encode_packet
 from rxcli.receiver import channel, still
 from rxcli.receiver.channel import denoise, metrics_of
 from rxcli.receiver.channel.denoise import COLUMN_FEATURES, STRIP_FEATURES, DenoiserInput, load_denoiser, network_inputs
-from rxcli.receiver.context import Failure, Timer
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel
 from rxcli.receiver.search import search
 from rxcli.resources import data_dir
 from rxcli.results.truth import Score
-from rxcli.types import Clock, FrameResult, SlotSamples
+from rxcli.types import Clock, Denoiser, FrameResult, SlotSamples
 
 N_COLUMNS, N_STRIPS, Q = 3, 5, 4
 N_SYMBOLS, W = 5, 5
@@ -375,7 +376,7 @@ def test_doubtful_columns_get_a_second_opinion(trials: dict[str, Trial]) -> None
 def test_the_receiver_goes_on_without_a_broken_model(trials: dict[str, Trial], monkeypatch: pytest.MonkeyPatch) -> None:
     never, _ = received(trials["hard"], "never")
 
-    def broken() -> denoise.Denoiser:
+    def broken() -> Denoiser:
         raise ProfileError("models/strips/model.onnx: does not match its checksum", "install the package again")
 
     monkeypatch.setattr(still, "_denoiser", broken)
@@ -387,7 +388,7 @@ def test_the_receiver_goes_on_without_a_broken_model(trials: dict[str, Trial], m
 
 def test_corrections_are_kept_only_where_they_leave_less_doubt(trials: dict[str, Trial]) -> None:
     options = trials["hard"].options()
-    found = search(trials["hard"].frame, options, Timer())
+    found = search(FrameCache(trials["hard"].frame), options)
     assert not isinstance(found, Failure)
     lock = found.best.acquisition
     seen = still.decode(lock, options.skip, found.best.reception)

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rxcli.receiver.plane import PlaneStore, read_plane, sample_rows, store, turned
+from rxcli.receiver.frame import cache
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.plane import read_plane, sample_rows, turned
 from rxcli.receiver.screen.geometry import column_outlines
 from rxcli.types import Frame, Lens, LightPlane, Outlines
 
@@ -75,16 +77,16 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         seen.append("sample")
         return sample_rows(*args)
 
-    monkeypatch.setattr(store, "read_plane", counted_read)
-    monkeypatch.setattr(store, "sample_rows", counted_sample)
+    monkeypatch.setattr(cache, "read_plane", counted_read)
+    monkeypatch.setattr(cache, "sample_rows", counted_sample)
     return seen
 
 
 def test_an_outline_is_sampled_once_and_its_sensor_rows_are_those_asked_for(reads: list[str]) -> None:
-    frame, planes = frame_of(), PlaneStore()
-    first = planes.sample(frame, outlines(), "srgb")
+    known = FrameCache(frame_of())
+    first = known.sample(outlines(), "srgb")
     bent = outlines(lens=CORRECTED)
-    again = planes.sample(frame, bent, "srgb")
+    again = known.sample(bent, "srgb")
     assert reads == ["read", "sample"]
     assert first.sensor_row is None
     np.testing.assert_array_equal(again.light, first.light)
@@ -92,16 +94,8 @@ def test_an_outline_is_sampled_once_and_its_sensor_rows_are_those_asked_for(read
 
 
 def test_what_is_elsewhere_or_of_another_tone_is_sampled_from_the_same_plane(reads: list[str]) -> None:
-    frame, planes = frame_of(), PlaneStore()
-    planes.sample(frame, outlines(), "srgb")
-    planes.sample(frame, outlines(shift=1.0), "srgb")
-    planes.sample(frame, outlines(), "linear")
+    known = FrameCache(frame_of())
+    known.sample(outlines(), "srgb")
+    known.sample(outlines(shift=1.0), "srgb")
+    known.sample(outlines(), "linear")
     assert reads == ["read", "sample", "sample", "sample"]
-
-
-def test_another_frame_is_read_and_the_one_before_forgotten(reads: list[str]) -> None:
-    one, other, planes = frame_of(), frame_of(seed=1), PlaneStore()
-    light = [planes.sample(frame, outlines(), "srgb").light for frame in (one, other, one)]
-    assert reads == ["read", "sample"] * 3
-    np.testing.assert_array_equal(light[0], light[2])
-    assert np.abs(light[0] - light[1]).max() > 0.01

@@ -16,7 +16,6 @@ from rxcli.receiver.screen import find, geometry
 from rxcli.receiver.screen.combs import find_combs, likeness
 from rxcli.receiver.screen.find import (
     ColumnLayout,
-    OutlineCandidate,
     find_screens,
     follow_outline,
     why_useless,
@@ -24,6 +23,7 @@ from rxcli.receiver.screen.find import (
 )
 from rxcli.receiver.screen.grid import columns_at, grid_between
 from rxcli.receiver.screen.numbering import LightProfile, centred, first_columns, light_profile
+from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.screen.rows import lit_range
 from rxcli.receiver.screen.strips import read_strips, shows_narrow_columns
@@ -107,21 +107,23 @@ def plane_of(pixels: NDArray[Any]) -> LightPlane:
     return read_plane(Frame(pixels, "memory"))
 
 
-def find_outlines(plane: LightPlane, layouts: list[ColumnLayout], lens: Lens | None = None) -> list[OutlineCandidate]:
+def find_outlines(plane: LightPlane, layouts: list[ColumnLayout], lens: Lens | None = None) -> list[Outline]:
     """Outlines of the clearest screen, likeliest first."""
     return next(iter(find_screens(plane, layouts, lens)), [])
 
 
 @lru_cache(maxsize=8)
-def found(picture: str) -> list[OutlineCandidate]:
+def found(picture: str) -> list[Outline]:
     return find_outlines(drawn(picture), [WIDE])
 
 
-def apart(candidate: OutlineCandidate, corners: FloatArray = CORNERS, lens: Lens | None = None) -> FloatArray:
+def apart(candidate: Outline, corners: FloatArray = CORNERS, lens: Lens | None = None) -> FloatArray:
     """Columns between a grid that was found and the true one, over the screen."""
     u, v = np.meshgrid(np.linspace(0.02, 0.98, 15), np.linspace(0.02, 0.98, 9), indexing="ij")
     points = geometry.screen_to_picture(np.stack([u, v], axis=-1), corners, lens)
-    return candidate.grid.columns_at(points) - candidate.layout.n_columns * u
+    assert candidate.grid is not None
+    assert candidate.n_columns is not None
+    return candidate.grid.columns_at(points) - candidate.n_columns * u
 
 
 @pytest.mark.parametrize("picture", ["white", "letterbox", "round", "window", "blobs"])
@@ -142,14 +144,14 @@ def test_where_the_outer_columns_are_dark_others_are_proposed() -> None:
     candidates = found("dark sides")
     assert candidates[1].log_odds > -3
     assert {round(float(np.median(apart(one)))) for one in candidates} >= {-1, 0, 1}
-    assert {"left", "right"} & set(candidates[0].unlit_sides)
+    assert {"left", "right"} & set(candidates[0].inferred)
 
 
 def test_corners_follow_from_the_columns_and_the_light() -> None:
     corners = found("white")[0].corners
     assert np.abs(corners[:, 0] - CORNERS[:, 0]).max() < 0.2 * 50
     assert np.abs(corners[:, 1] - CORNERS[:, 1]).max() < 0.02 * 590
-    assert found("white")[0].unlit_sides == ()
+    assert found("white")[0].inferred == ()
 
 
 def test_a_picture_with_bars_lies_in_the_middle_of_the_screen() -> None:
@@ -157,7 +159,7 @@ def test_a_picture_with_bars_lies_in_the_middle_of_the_screen() -> None:
         corners[2:, 1].mean() - corners[:2, 1].mean() for corners in (found("letterbox")[0].corners, CORNERS)
     )
     assert found_height == pytest.approx(true_height, rel=0.02)
-    assert {"top", "bottom"} <= set(found("letterbox")[0].unlit_sides)
+    assert {"top", "bottom"} <= set(found("letterbox")[0].inferred)
 
 
 @pytest.mark.parametrize("rows_per_slot", [1.6, 3.0, 8.0])
@@ -237,14 +239,14 @@ def test_a_screen_larger_than_the_picture_shows_no_side() -> None:
     large = np.array([[-160.0, 300.0], [1380.0, 280.0], [1400.0, 1170.0], [-180.0, 1140.0]])
     candidates = find_outlines(drawn("white", large), [WIDE])
     assert candidates[0].fills
-    assert {"left", "right"} <= set(candidates[0].unlit_sides)
+    assert {"left", "right"} <= set(candidates[0].inferred)
     off = apart(candidates[0], large)
     assert np.abs(off - np.round(np.median(off))).max() < 0.3
 
 
 def test_numbers_of_columns_compete() -> None:
     candidates = find_outlines(drawn("white"), [ColumnLayout(10), WIDE, ColumnLayout(40)])
-    assert candidates[0].layout == WIDE
+    assert candidates[0].n_columns == WIDE.n_columns
     assert np.abs(apart(candidates[0])).max() < 0.2
 
 
@@ -372,7 +374,7 @@ def narrow_film() -> NDArray[np.uint8]:
 
 def test_a_hundred_columns_are_found_in_a_film_with_bars() -> None:
     candidate = find_outlines(plane_of(narrow_film()), [WIDE, NARROW])[0]
-    assert candidate.layout == NARROW
+    assert candidate.n_columns == NARROW.n_columns
     # The film lies in the middle, and so do its columns.
     assert np.abs(apart(candidate, NARROW_CORNERS)).max() < 0.35
     grid = grid_between(NARROW_CORNERS, 100, (NARROW_WIDTH, NARROW_HEIGHT), None)

@@ -20,11 +20,12 @@ from rxcli.lab.simulate.scenes import preset
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, parse_profile, shipped_profiles
 from rxcli.receiver import camera as blind
-from rxcli.receiver import corners as outlines
-from rxcli.receiver.context import Failure, Outline, Timer
-from rxcli.receiver.pipeline import receive_frame
-from rxcli.receiver.screen import geometry
-from rxcli.receiver.search import Found, search
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.receive import receive_frame
+from rxcli.receiver.screen.grid import grid_between
+from rxcli.receiver.screen.outline import Outline
+from rxcli.receiver.search import Found, outlines, search
 from rxcli.receiver.search.evidence import distinct_share
 from rxcli.receiver.search.numbers import less_likely_outlines
 from rxcli.receiver.search.propose import Proposer
@@ -96,12 +97,13 @@ def test_the_order_of_proposals_screens_and_cameras_does_not_matter(
 def test_columns_are_read_through_the_estimated_lens_where_the_camera_has_none(known: bool) -> None:
     trial = trial_of("paper-17k3")
     assert trial.camera.lens is not None
-    lens = geometry.lens_for(trial.camera.lens, trial.frame.width, trial.frame.height)
-    outline = Outline(trial.corners, lens=lens)
+    grid = grid_between(trial.corners, 20, (trial.frame.width, trial.frame.height), None)
+    outline = Outline(trial.corners, grid=grid)
     options = trial.options() if known else replace(trial.options(), cameras=(), force_camera=False)
-    proposer = Proposer(trial.frame, options, Timer(), (outline,))
+    proposer = Proposer(FrameCache(trial.frame), options, (outline,))
     camera = proposer.context(next(proposer.cameras())[0]).camera
-    assert (camera.lens is lens) == (not known)
+    assert camera.lens is not None
+    assert camera.lens.dist_coeffs.any() == known
 
 
 @pytest.mark.parametrize("screen", ["paper-17k3", "paper-34k6", "paper-8k65"])
@@ -122,7 +124,7 @@ def test_outlines_are_read_as_screens_of_their_columns() -> None:
     trial = trial_of("paper-17k3")
     possible = tuple(Outline(trial.corners, log_odds=-n / 10, family=n, n_columns=n) for n in (20, 24, 50))
     options = replace(trial.options(), screens=(*SHIPPED, *more_screens()))
-    proposer = Proposer(trial.frame, options, Timer(), possible)
+    proposer = Proposer(FrameCache(trial.frame), options, possible)
     hypotheses = next(proposer.cameras())
     assert {one.outline.family for one in hypotheses} == {20, 24}
     assert all(one.screen.columns == one.outline.n_columns for one in hypotheses)
@@ -137,13 +139,14 @@ def test_columns_that_repeat_their_neighbour_say_nothing_more(repeats: int, shar
 
 def test_columns_with_packets_are_not_left_out_of_the_screen() -> None:
     trial = trial_of("paper-17k3")
-    options, timer = ReceiverOptions(corners=trial.corners, cameras=(trial.camera,), force_camera=True), Timer()
-    found = search(trial.frame, options, timer)
+    options = ReceiverOptions(corners=trial.corners, cameras=(trial.camera,), force_camera=True)
+    cache = FrameCache(trial.frame)
+    found = search(cache, options)
     assert isinstance(found, Found)
     own = found.best.hypothesis.outline
     side = (own.corners[1] - own.corners[0]) / found.best.hypothesis.screen.columns
     rivals = [replace(own, corners=own.corners + shift * side, log_odds=-0.5) for shift in (-2, 1)]
-    proposer = Proposer(trial.frame, options, timer, (own, *rivals), None)
+    proposer = Proposer(cache, options, (own, *rivals), None)
     kept, *less_likely = less_likely_outlines(found.best, (own, *rivals), proposer)
     assert kept is own
     assert max(one.log_odds for one in less_likely) < -3.0
@@ -157,7 +160,7 @@ def test_every_hypothesis_is_recorded_with_its_fate(tmp_path: Path) -> None:
     options = ReceiverOptions(
         screens=(screen, *SHIPPED), cameras=(camera,), force_camera=True, corners=corners, cae="never"
     )
-    found = search(frame, options, Timer())
+    found = search(FrameCache(frame), options)
     assert isinstance(found, Found)
     assert [one.fate for one in found.tried].count("won") == 1
     won = next(one for one in found.tried if one.fate == "won")
@@ -174,7 +177,7 @@ def test_a_refusal_says_what_came_nearest() -> None:
     frame = Frame(rng.integers(90, 110, (620, 340), np.uint8), "noise")
     corners = np.array([[10, 10], [329, 10], [329, 609], [10, 609]], float)
     camera = parse_profile(CAMERA, CameraProfile, "camera")
-    found = search(frame, ReceiverOptions(cameras=(camera,), force_camera=True, corners=corners), Timer())
+    found = search(FrameCache(frame), ReceiverOptions(cameras=(camera,), force_camera=True, corners=corners))
     if isinstance(found, Found):
         assert found.best.evidence < 40
     else:
@@ -186,6 +189,6 @@ def test_a_refusal_says_what_came_nearest() -> None:
 
 def test_the_budget_bounds_the_passes() -> None:
     trial = trial_of("paper-17k3")
-    found = search(trial.frame, replace(trial.options(), screens=SHIPPED), Timer(), budget=1)
+    found = search(FrameCache(trial.frame), replace(trial.options(), screens=SHIPPED), budget=1)
     assert isinstance(found, Found)
     assert len(found.tried) == 1

@@ -12,8 +12,8 @@ from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_o
 
 from rxcli.protocol import encode_packet
 from rxcli.receiver import channel
-from rxcli.receiver.acquisition import noise_of
 from rxcli.receiver.decode import detect
+from rxcli.receiver.frame.acquisition import noise_of
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma, slot_llr
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import BurstPosteriors, Clock, RowProfiles, SlotSamples

@@ -1,4 +1,4 @@
-"""Find the screen's corners in a frame, or explain why there are none. Part of the wiring."""
+"""Outlines of the screens in a frame, given or proposed by the finder; or why there are none."""
 
 from __future__ import annotations
 
@@ -8,13 +8,16 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.cameras import known_lens
-from rxcli.receiver.context import Failure, FrameContext, Outline, Timer
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.context import FrameContext
+from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.plane import turned
+from rxcli.receiver.plane.orientation import PORTRAIT
 from rxcli.receiver.screen import find, geometry
 from rxcli.receiver.screen.bright import bright_quadrilateral
-from rxcli.receiver.settings import SETTINGS
-from rxcli.receiver.turned import PORTRAIT
+from rxcli.receiver.screen.outline import Outline
+from rxcli.receiver.search.cameras import known_lens
+from rxcli.receiver.search.settings import SETTINGS
 from rxcli.types import FloatArray, Frame
 
 _TOO_SLOW = (
@@ -34,65 +37,54 @@ _SHOW_COLUMNS = (
 )
 
 
-def proposed_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> list[list[Outline]] | Failure:
+def proposed_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[Outline]] | Failure:
     """Candidate outlines, at least one, of every screen in a frame; or why there are none."""
+    frame = cache.frame
     refused = unreadable_orientation(frame)
     if refused is not None:
         return refused
     if options.corners is not None:
-        with timer("geometry"):
-            return outside_the_picture(options.corners, frame) or [[_given(options.corners, frame, options, timer)]]
-    found = possible_screens(frame, options, timer)
+        with cache.timer("geometry"):
+            return outside_the_picture(options.corners, frame) or [[_given(options.corners, cache, options)]]
+    found = possible_screens(cache, options)
     if found:
         return found
     if "no_screen" in options.skip or not may_fill(frame):
-        return no_screen(frame, options, timer)
+        return no_screen(cache, options)
     return [[Outline(whole_picture(frame), inferred=geometry.SIDE_NAMES, column_offset=None)]]
 
 
-def no_screen(frame: Frame, options: ReceiverOptions, timer: Timer) -> Failure:
+def no_screen(cache: FrameCache, options: ReceiverOptions) -> Failure:
     """Failure of a picture without a screen."""
-    reason = ON_ITS_SIDE if lies_on_its_side(frame, options, timer) else reason_for_none(frame)
+    reason = ON_ITS_SIDE if lies_on_its_side(cache, options) else reason_for_none(cache.frame)
     return Failure("no_screen", f"no screen found: {reason}")
 
 
-def _given(corners: FloatArray, frame: Frame, options: ReceiverOptions, timer: Timer) -> Outline:
+def _given(corners: FloatArray, cache: FrameCache, options: ReceiverOptions) -> Outline:
     """The outline that a user gave, with the number of columns if they are narrow."""
-    narrow = [layout.n_columns for layout in layouts_of(options) if layout.is_narrow]
-    if len(narrow) != 1 or len(options.screens) == 1:
+    narrow = [layout for layout in layouts_of(options) if layout.is_narrow]
+    if len(narrow) != 1 or len(options.screens) == 1 or not find.shows_narrow(cache.plane):
         return Outline(corners)
-    return Outline(corners, n_columns=narrow[0] if find.shows_narrow(timer.planes.plane(frame)) else None)
+    return Outline(corners, n_columns=narrow[0].n_columns)
 
 
-def possible_screens(frame: Frame, options: ReceiverOptions, timer: Timer) -> list[list[Outline]]:
+def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[Outline]]:
     """Outlines that the finder proposes of every screen."""
-    layouts = layouts_of(options)
-    with timer("geometry"):
-        plane = timer.planes.plane(frame)
-        bright = bright_quadrilateral(plane)
-        screens = find.find_screens(plane, layouts, known_lens(frame, options), bright)
-    single_wide = sum(not layout.is_narrow for layout in layouts) == 1
+    layouts, frame = layouts_of(options), cache.frame
+    with cache.timer("geometry"):
+        bright = bright_quadrilateral(cache.plane)
+        screens = find.find_screens(cache.plane, layouts, known_lens(frame, options), bright)
+    wide = [layout.n_columns for layout in layouts if not layout.is_narrow]
 
-    def outline(candidate: find.OutlineCandidate) -> Outline:
-        is_usual = single_wide and not candidate.layout.is_narrow
-        found = Outline(
-            candidate.corners,
-            inferred=candidate.unlit_sides,
-            log_odds=candidate.log_odds,
-            family=candidate.family,
-            fills=candidate.fills,
-            stands_out=candidate.stands_out,
-            strips=candidate.strips,
-            lens=candidate.grid.estimated_lens,
-            n_columns=None if is_usual else candidate.layout.n_columns,
-        )
-        return _as_viewed(found, frame.metadata.orientation)
+    def viewed(outline: Outline) -> Outline:
+        """The outline with its corners in the viewer's order; the only wide layout may be that of any screen."""
+        corners = geometry.viewer_order(outline.corners, frame.metadata.orientation)
+        return replace(outline, corners=corners, n_columns=None if wide == [outline.n_columns] else outline.n_columns)
 
-    outlines = [[outline(candidate) for candidate in screen] for screen in screens]
+    outlines = [[viewed(outline) for outline in screen] for screen in screens]
     if len(outlines) == 1 and bright is not None:
         # The picture on the screen may show borders that are none of the columns'.
-        own = Outline(bright, _BRIGHT_CERTAINTY, log_odds=_BRIGHT_LOG_ODDS, family=-1)
-        own = _as_viewed(own, frame.metadata.orientation)
+        own = viewed(Outline(bright, _BRIGHT_CERTAINTY, log_odds=_BRIGHT_LOG_ODDS, family=-1))
         tolerance = _SAME_OUTLINE * np.ptp(bright[:, 0])
         if all(np.abs(outline.corners - own.corners).max() >= tolerance for outline in outlines[0]):
             outlines[0].append(own)
@@ -103,11 +95,6 @@ def layouts_of(options: ReceiverOptions) -> list[find.ColumnLayout]:
     """Column layouts of the screen profiles, in ascending order of columns."""
     by_columns = {screen.columns: screen for screen in options.screens}
     return [find.ColumnLayout(n, by_columns[n].light_spread, by_columns[n].aspect) for n in sorted(by_columns)]
-
-
-def _as_viewed(outline: Outline, orientation: int) -> Outline:
-    """An outline with its corners in the viewer's order."""
-    return replace(outline, corners=geometry.viewer_order(outline.corners, orientation))
 
 
 def unreadable_orientation(frame: Frame) -> Failure | None:
@@ -159,10 +146,10 @@ def whole_picture(frame: Frame) -> FloatArray:
     return geometry.viewer_order(corners, frame.metadata.orientation)
 
 
-def lies_on_its_side(frame: Frame, options: ReceiverOptions, timer: Timer) -> bool:
+def lies_on_its_side(cache: FrameCache, options: ReceiverOptions) -> bool:
     """Whether columns lie along the rows of a picture. Of a clip only the first frame is examined."""
     wide = [layout for layout in layouts_of(options) if not layout.is_narrow]
-    screens = [] if frame.index else find.find_screens(turned(timer.planes.plane(frame)), wide)
+    screens = [] if cache.frame.index else find.find_screens(turned(cache.plane), wide)
     return any(screen[0].stands_out for screen in screens)
 
 
@@ -180,7 +167,7 @@ def reason_for_none(frame: Frame) -> str:
 def too_small(context: FrameContext, screen: ScreenProfile) -> str | None:
     """Message if no packet of `screen` fits the rows that show it, or None."""
     frame, camera = context.frame, context.camera
-    fill = float(np.ptp(np.clip(context.corners[:, 1], 0, frame.height - 1))) / frame.height
+    fill = float(np.ptp(np.clip(context.sampled_corners[:, 1], 0, frame.height - 1))) / frame.height
     needed = screen.packet_s / (camera.line_delay_s * frame.height)
     if fill >= needed:
         return None

@@ -1,4 +1,4 @@
-"""Reception of a frame on a given clock, and its assessment: packets, doubtful columns, dark columns. Wiring."""
+"""Reception of a frame on a given clock, and its assessment: packets, doubtful columns, dark columns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.decode.settings import SETTINGS as decode_settings
 from rxcli.receiver.decode.soft_bits import assume_unobserved_certain, still_soft_bits
 from rxcli.receiver.decode.steady import is_steady
-from rxcli.receiver.settings import SETTINGS
+from rxcli.receiver.frame.settings import SETTINGS
 from rxcli.types import (
     BoolArray,
     BurstPosteriors,

@@ -1,4 +1,4 @@
-"""Sampled columns, and the acquired screen with its clock. Part of the wiring."""
+"""A screen whose clock was found, with its sampled columns; and screens that a picture does not distinguish."""
 
 from __future__ import annotations
 
@@ -9,16 +9,9 @@ from functools import cached_property
 import numpy as np
 
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver import camera as blind
-from rxcli.receiver import plane
-from rxcli.receiver.context import FrameContext
 from rxcli.receiver.light import MIN_VARIANCE
-from rxcli.receiver.screen import geometry
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import Clock, IntArray, Outlines, RowProfiles
-
-#: Outlines of one frame that are kept.
-_MAX_OUTLINES = 8
+from rxcli.types import Clock, IntArray, RowProfiles
 
 
 @dataclass(frozen=True)
@@ -56,28 +49,6 @@ class Acquisition:
         """The acquisition of some columns."""
         clock = replace(self.clock, delay_slots=self.clock.delay_slots[part])
         return replace(self, profiles=self.profiles.of_columns(part), clock=clock)
-
-
-def outlines_of(context: FrameContext, n_columns: int) -> Outlines:
-    """Outlines of the strips of a screen's columns, computed once for each place and lens."""
-    frame, corners, lens = context.frame, context.corners, context.camera.lens
-    known = context.timer.outlines
-    bent = lens and (lens.camera_matrix.tobytes(), lens.dist_coeffs.tobytes(), lens.corrected)
-    key = (frame.width, frame.height, corners.tobytes(), n_columns, bent)
-    if key not in known:
-        if len(known) >= _MAX_OUTLINES:
-            known.clear()
-        n_strips = plane.strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
-        known[key] = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, lens)
-    return known[key]
-
-
-def sample_columns(context: FrameContext, n_columns: int) -> RowProfiles:
-    """Sample the row profiles of a screen of `n_columns` columns in order of time."""
-    frame, camera = context.frame, context.camera
-    with context.timer("sampling"):
-        profiles = context.timer.planes.sample(frame, outlines_of(context, n_columns), camera.tone)
-        return blind.in_time_order(profiles, frame.height) if camera.reversed else profiles
 
 
 def noise_of(profiles: RowProfiles) -> float:

@@ -1,4 +1,4 @@
-"""Settings of the wiring (screen, camera, presence of packets) and of the passes of a still."""
+"""Settings of the presence of packets, and of the passes of a still."""
 
 from __future__ import annotations
 
@@ -6,19 +6,12 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class WiringSettings:
+class PassSettings:
     """Thresholds, each with its unit and its reason."""
 
     #: Log-likelihood ratio of headers and packets below which a picture contains no packets: without data it is below
     #: 10, with packets at least 74 in 120 hard pictures.
     min_packets_llr: float = 20.0
-
-    #: Largest shift of the light of one lamp between columns, slots: blinds may be slanted.
-    max_column_shift_slots: int = 10
-    #: Detection of switched light without a clock: smoothing and longest period, rows; minimum explained share.
-    smooth_rows: int = 2
-    max_period_rows: int = 100
-    switched_share: float = 0.7
 
     #: Log-likelihood below the best weight at which a weight is dropped.
     weight_margin: float = 20.0
@@ -27,15 +20,6 @@ class WiringSettings:
     #: Log-likelihood ratio from which a column has packets even without a header: of 16 packets more than at 100 in 350
     #: stills all were right. Wrong clocks, which show none in any column, reach 74.
     min_headerless_llr: float = 60.0
-
-    #: Minimum overlap of a given outline and the picture, as a fraction of either.
-    min_overlap: float = 0.002
-    #: Minimum number of rows for blind camera estimation.
-    min_rows: int = 24
-    #: Mean, as a share of white, below which a picture without a screen is reported as dark.
-    dark_mean: float = 0.08
-    #: Largest size of an outline relative to the picture, beyond which less than one column is visible.
-    largest_outline: float = 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,4 +34,4 @@ class StillSettings:
     max_network_slots: int = 100_000
 
 
-SETTINGS, STILL = WiringSettings(), StillSettings()
+SETTINGS, STILL = PassSettings(), StillSettings()

@@ -1,0 +1,65 @@
+"""A frame with the plane that was read of it and the row profiles that were sampled from the plane."""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from rxcli.receiver.frame.timer import Timer
+from rxcli.receiver.plane import read_plane, sample_rows, strips_per_column
+from rxcli.receiver.screen import geometry
+from rxcli.types import Float32Array, FloatArray, Frame, Lens, LightPlane, Metadata, Outlines, RowProfiles
+
+#: Cached row profiles: of layouts with few and with many columns, and of uncertain outlines; and cached outlines.
+_MAX_SAMPLED, _MAX_OUTLINES = 4, 8
+
+
+class FrameCache:
+    """Reads a frame once, and samples each outline once while screens, packets and cameras are compared.
+
+    Args:
+        frame: the picture.
+        timer: counts the time of each stage; a new one if left out.
+    """
+
+    def __init__(self, frame: Frame, timer: Timer | None = None) -> None:
+        self.frame, self.timer = frame, timer or Timer()
+        self._sampled: list[tuple[str, Float32Array, RowProfiles]] = []
+        self._outlines: dict[tuple[Any, ...], Outlines] = {}
+
+    def with_metadata(self, metadata: Metadata) -> FrameCache:
+        """The same picture with other metadata; what was read of it is kept."""
+        changed = copy(self)
+        changed.frame = replace(self.frame, metadata=metadata)
+        return changed
+
+    @cached_property
+    def plane(self) -> LightPlane:
+        """The plane of the frame."""
+        return read_plane(self.frame)
+
+    def outlines(self, corners: FloatArray, n_columns: int, lens: Lens | None) -> Outlines:
+        """Outlines of the strips of a screen's columns; as many strips as its pixels allow."""
+        bent = lens and (lens.camera_matrix.tobytes(), lens.dist_coeffs.tobytes(), lens.corrected)
+        key = (corners.tobytes(), n_columns, bent)
+        if key not in self._outlines:
+            if len(self._outlines) >= _MAX_OUTLINES:
+                self._outlines.clear()
+            n_strips = strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
+            size = self.frame.width, self.frame.height
+            self._outlines[key] = geometry.column_outlines(corners, n_columns, n_strips, *size, lens)
+        return self._outlines[key]
+
+    def sample(self, outlines: Outlines, tone: str) -> RowProfiles:
+        """Cached `sample_rows`; sensor rows are those of `outlines`, as a lens model may change them alone."""
+        for known_tone, edges, profiles in self._sampled:
+            same = known_tone == tone and profiles.light.shape == outlines.inside.shape
+            if same and np.array_equal(edges, outlines.edges_x) and np.array_equal(profiles.rows, outlines.rows):
+                return replace(profiles, sensor_row=outlines.sensor_row)
+        profiles = sample_rows(self.plane, outlines, tone)
+        self._sampled = [*self._sampled[-_MAX_SAMPLED + 1 :], (tone, outlines.edges_x, profiles)]
+        return profiles

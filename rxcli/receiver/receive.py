@@ -1,0 +1,172 @@
+"""The receiver: `receive_frame` reads as the block diagram.
+
+`search` finds the screen, its camera and its clock, `still` alternates light model and detection, and `clip` carries
+knowledge from frame to frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from itertools import chain
+from typing import Any
+
+from rxcli.numerics import one_blas_thread
+from rxcli.options import ReceiverOptions
+from rxcli.profiles import ScreenProfile
+from rxcli.receiver.decode import assemble
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.passes import Reception, headerless, soft_bits
+from rxcli.receiver.frame.result import Failure, Received, failed
+from rxcli.receiver.screen.outline import Outline
+from rxcli.receiver.search import search
+from rxcli.receiver.search.attempts import receive_either_way
+from rxcli.receiver.search.outlines import no_screen, proposed_screens, too_small
+from rxcli.receiver.still import apply_autoencoder, decode_photograph
+from rxcli.receiver.sync import clock as sync
+from rxcli.types import FloatArray, Frame, FrameResult, OnTaps
+
+_COUNTED_FROM_LEFT = (
+    "no side of the screen is in view: columns are counted from the leftmost visible one; take one side into view to "
+    "have the screen's numbers"
+)
+
+
+def receive(frames: Iterable[Frame], options: ReceiverOptions, on_taps: OnTaps | None = None) -> Iterator[FrameResult]:
+    """Receive the frames of one source; yields one result per frame, in order.
+
+    Results of a clip are delayed by some frames, because a packet is reported in the last frame that shows it.
+
+    Args:
+        frames: of one source.
+        options: of the receiver.
+        on_taps: is given the arrays at the stage boundaries of every frame that was received.
+    """
+    options = _in_total_order(options)
+    with closing(_iterator(frames)) as source:
+        frame_0 = next(source, None)
+        if frame_0 is None:
+            return
+        try:
+            frame_1 = next(source, None)
+        except Exception:
+            yield receive_frame(frame_0, options, on_taps)
+            raise
+        if frame_1 is None:
+            yield receive_frame(frame_0, options, on_taps)
+            return
+        from rxcli.receiver.clip import receive_clip
+
+        for result in receive_clip(chain((frame_0, frame_1), source), options, on_taps):
+            yield result.with_columns_mirrored() if options.mirrored else result
+
+
+def _iterator(frames: Iterable[Frame]) -> Generator[Frame, None, None]:
+    """The frames as a generator, whose end also ends theirs: a file is closed when reception is left early."""
+    yield from frames
+
+
+def _in_total_order(options: ReceiverOptions) -> ReceiverOptions:
+    """Sort the profiles, so that a result does not depend on their order."""
+    screens = sorted(options.screens, key=lambda s: (s.columns, -s.slot_rate_hz, s.packet_slots, s.name))
+    cameras = options.cameras if options.force_camera else tuple(sorted(options.cameras, key=lambda c: c.name))
+    return replace(options, screens=tuple(screens), cameras=cameras)
+
+
+def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None = None) -> FrameResult:
+    """Receive one frame as a photograph; see `receive`."""
+    cache = FrameCache(frame)
+    with one_blas_thread():
+        received = receive_either_way(cache, _in_total_order(options), _receive_still)
+    if on_taps is not None and received.taps:
+        on_taps(frame.source, frame.index, received.taps)
+    result = received.result
+    result = replace(result, message=_with_tried(result, options.screens), timing_ms=cache.timer.total())
+    if options.mirrored:
+        return result.with_columns_mirrored()
+    return replace(result, mirrored=None if frame.metadata.names_front_camera else False)
+
+
+def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str | None:
+    """Message of a failure; if only one screen was tried, it names that screen."""
+    if result.status != "no_signal" or result.message is None or len(screens) != 1:
+        return result.message
+    return f"{result.message}; only the screen {screens[0].name} was tried (--screen auto tries all)"
+
+
+def _receive_still(cache: FrameCache, options: ReceiverOptions) -> Received:
+    """Receive every screen in a frame; the one with the most packets comes first."""
+    nothing = FrameResult(cache.frame.source, cache.frame.index, cache.frame.time_s, "ok")
+    screens = proposed_screens(cache, options)
+    if isinstance(screens, Failure):
+        return Received(failed(nothing, screens), {})
+    received = [_receive_screen(nothing, cache, outlines, options) for outlines in screens]
+    if not screens[0][0].stands_out and not received[0].result.packets:
+        return Received(failed(nothing, no_screen(cache, options)), {})
+    best, *less = sorted(received, key=lambda screen: -screen.n_believable)
+    other_screens = tuple(screen.result for screen in less if screen.result.packets)
+    return best._replace(result=replace(best.result, other_screens=other_screens))
+
+
+def _receive_screen(
+    nothing: FrameResult, cache: FrameCache, outlines: list[Outline], options: ReceiverOptions
+) -> Received:
+    """Receive one screen; `nothing` is the result without any."""
+    frame, timer = cache.frame, cache.timer
+    # Search: where the columns are, what a row is in time, which screen and clock.
+    found = search(cache, options, outlines=outlines)
+    if isinstance(found, Failure):
+        return Received(failed(nothing, found), {})
+    outline, context, acquisition = found.outline, found.best.context, found.best.acquisition
+    camera = context.camera
+    # Channel and decode, in turn: metrics of slots to symbols, and symbols to the picture.
+    with timer("detect"):
+        reception = decode_photograph(acquisition, options.skip, found.best.reception)
+        no_header = headerless(reception)
+    with timer("denoise"):
+        reception, denoised, report = apply_autoencoder(acquisition, reception, options)
+    # Packets, with the probability that they are right.
+    columns = assemble.column_results(
+        reception.clock,
+        reception.posteriors,
+        reception.snr,
+        reception.n_observed,
+        reception.confidence_features(reception.posteriors, denoised),
+        no_header,
+        options.min_confidence,
+        denoised,
+        outline.certainty,
+    )
+    if camera.reversed:
+        columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
+    result = replace(
+        nothing,
+        status=assemble.frame_status(columns),
+        **outline.result_fields,
+        **camera.result_fields,
+        search=tuple(tried.step for tried in found.tried),
+        screen_profile=acquisition.variant(sync.likely_repeats(reception.clock, acquisition.repeats)).name,
+        columns=columns,
+        denoiser=report,
+        skipped=reception.skipped,
+        soft_bits=soft_bits(frame, reception, no_header, denoised) if options.soft_bits else None,
+    )
+    if result.status == "no_signal":
+        result = replace(result, message=too_small(context, acquisition.screen) or assemble.why_no_packet(columns))
+    elif outline.is_counted_from_left:
+        result = replace(result, message=_COUNTED_FROM_LEFT)
+    return Received(result, _taps(outline.corners, acquisition, reception))
+
+
+def _taps(corners: FloatArray, acquisition: Acquisition, reception: Reception) -> dict[str, Any]:
+    """Arrays at the stage boundaries, by stage."""
+    return {
+        "geometry.corners": corners,
+        "sampling": acquisition.profiles,
+        "clock": reception.clock,
+        "samples": reception.samples,
+        "channel.metrics": reception.metrics,
+        "detect": reception.posteriors,
+    }

@@ -1,0 +1,128 @@
+"""Other ways to read a photograph that gives few packets: with an estimated camera, and turned by 90 degrees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+from rxcli.options import ReceiverOptions
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.camera import FrameCamera
+from rxcli.receiver.frame.result import Failure, Received, failed
+from rxcli.receiver.plane import orientation
+from rxcli.receiver.search.cameras import known_camera
+from rxcli.receiver.search.outlines import ON_ITS_SIDE, lies_on_its_side, unreadable_orientation
+from rxcli.types import Frame, FrameResult
+
+_UPSIDE_DOWN = (
+    "the rows run against the readout, as in a picture that was turned upside down or mirrored after it was taken; "
+    "columns count from the left of the stored picture"
+)
+_AS_STORED = (
+    "the file asks to be turned by 90 degrees, but the columns stand upright in the stored picture; they are counted "
+    "from its left"
+)
+#: Relative difference of line delays up to which an estimate agrees with a profile, and confidence of a sure packet.
+_SAME_LINE_DELAY, _SURE = 0.01, 0.9
+#: Receives a photograph as it is.
+_Receive = Callable[[FrameCache, ReceiverOptions], Received]
+
+
+def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Receive) -> Received:
+    """Receive a frame as it is stored; without packets, also turned by 90 degrees if its columns lie along its rows."""
+    frame, asks_for_turn = cache.frame, cache.frame.metadata.orientation in orientation.PORTRAIT
+    upright = cache.with_metadata(replace(frame.metadata, orientation=1)) if asks_for_turn else cache
+    received = _receive_stated(upright, options, receive)
+    if received.n_believable:
+        remark = _UPSIDE_DOWN if _is_reversed(received.result) else _AS_STORED if asks_for_turn else None
+        return received.with_remark(remark)
+    if options.corners is not None or frame.mosaic is not None or not lies_on_its_side(upright, options):
+        return received
+    attempts = []
+    for quarter_turns in orientation.QUARTER_TURNS:
+        back = orientation.turned_frame(frame, quarter_turns)
+        attempt = _receive_stated(FrameCache(back, cache.timer), options, receive)
+        result, n_packets = orientation.as_stored(back, attempt.result, quarter_turns), attempt.n_believable
+        rank = n_packets * (not _is_reversed(result)), n_packets, quarter_turns
+        attempts.append((rank, attempt._replace(result=result)))
+    (_, n_packets, quarter_turns), best = max(attempts, key=lambda attempt: attempt[0])
+    if n_packets:
+        return best.with_remark(orientation.remark(quarter_turns))
+    failure = unreadable_orientation(frame) or Failure("no_screen", f"no screen found: {ON_ITS_SIDE}")
+    return Received(failed(received.result, failure), {})
+
+
+def _receive_stated(cache: FrameCache, options: ReceiverOptions, receive: _Receive) -> Received:
+    """Receive a frame as profile and file state its camera; where few columns give packets, also as it is estimated."""
+    best = stated = receive(cache, options)
+    for attempt, estimating in _with_estimates(cache, options):
+        if not _gives_few(best.result):
+            break
+        received = receive(attempt, estimating)
+        if received.n_believable > best.n_believable and _is_credible(received.result, cache.frame, options):
+            message = _difference(cache.frame, options, stated, received, is_exposure=attempt is not cache)
+            best = received.with_remark(message)
+    return best
+
+
+def _gives_few(result: FrameResult) -> bool:
+    """Whether less than half of the lit columns gave a packet."""
+    lit = [column for column in result.columns if column.status != "dark"]
+    return 2 * sum(column.status == "ok" for column in lit) < max(len(lit), 1)
+
+
+def _is_reversed(result: FrameResult) -> bool:
+    return result.estimated.get("readout_reversed", (0.0, 0.0))[0] > 0
+
+
+def _with_estimates(cache: FrameCache, options: ReceiverOptions) -> Iterator[tuple[FrameCache, ReceiverOptions]]:
+    """The frame without its camera profile, then without its stated exposure as well: both are estimated."""
+    frame, estimated = cache.frame, replace(options, cameras=(), force_camera=False)
+    if known_camera(frame, options) is not None:
+        yield cache, estimated
+    if frame.metadata.exposure_s is not None:
+        yield cache.with_metadata(replace(frame.metadata, exposure_s=None)), estimated
+
+
+def _is_credible(estimated: FrameResult, frame: Frame, options: ReceiverOptions) -> bool:
+    """Whether a result with an estimated camera outweighs a profile; one with another line delay needs sure packets.
+
+    Under a screen that is not the one in the picture, an estimate of the camera may fit what a profile rules out.
+    """
+    known, line_delay_s = known_camera(frame, options), estimated.line_delay_s
+    if not isinstance(known, FrameCamera) or line_delay_s is None:
+        return True
+    if abs(line_delay_s / known.line_delay_s - 1) < _SAME_LINE_DELAY:
+        return True
+    lit = [column for column in estimated.columns if column.status != "dark"]
+    n_sure = sum(any(p.confidence > _SURE for p in column.packets) for column in lit)
+    return 2 * n_sure > len(lit)
+
+
+def _difference(
+    frame: Frame, options: ReceiverOptions, stated: Received, estimated: Received, *, is_exposure: bool
+) -> str:
+    """Message of a result with an estimated camera: what was stated, and what was estimated.
+
+    Args:
+        frame: the picture.
+        options: those with the stated camera.
+        stated: result with the stated camera.
+        estimated: result with the estimate.
+        is_exposure: whether the exposure was estimated as well.
+    """
+    known, exposure_s = known_camera(frame, options), frame.metadata.exposure_s if is_exposure else None
+    if isinstance(known, Failure):
+        return known.message
+    before, after, check = [], [], "check what wrote the file's exposure"
+    if known is not None:
+        before.append(f"camera profile {known.profile} ({1e6 * known.line_delay_s:.3f} us a row)")
+        after.append(f"{1e6 * (estimated.result.line_delay_s or 0.0):.3f} us a row")
+        check = f"leave out or replace that profile, or {check}" if exposure_s else "leave out or replace that profile"
+    if exposure_s is not None:
+        before.append(f"the stated exposure ({1e6 * exposure_s:.0f} us)")
+        after.append(f"an exposure of {1e6 * (estimated.result.exposure_s or 0.0):.0f} us")
+    return (
+        f"{' and '.join(before)} gave {stated.n_believable} packets, an estimate ({', '.join(after)}) "
+        f"{estimated.n_believable}, which are reported; {check}"
+    )

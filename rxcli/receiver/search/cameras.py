@@ -1,0 +1,128 @@
+"""Cameras of a frame: from a profile, or proposed from the picture and fitted to decoded slots."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import replace
+
+from rxcli.options import ReceiverOptions
+from rxcli.profiles import ScreenProfile, match_camera
+from rxcli.receiver.camera import CameraHypothesis, Strips, lens_of, propose, strips_of, summary, why_not
+from rxcli.receiver.camera import settle as settle_hypothesis
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.camera import FrameCamera
+from rxcli.receiver.frame.context import FrameContext
+from rxcli.receiver.frame.passes import Reception
+from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.screen import geometry
+from rxcli.types import FloatArray, Frame, Lens, RowProfiles
+
+DEFAULT_TONE = "srgb"
+
+
+def known_camera(frame: Frame, options: ReceiverOptions) -> FrameCamera | Failure | None:
+    """Camera from the matching profile, or None."""
+    meta = frame.metadata
+    profile = (
+        options.cameras[0]
+        if options.force_camera
+        else match_camera(options.cameras, meta.make, meta.model, frame.width, frame.height)
+    )
+    if profile is None:
+        return None
+    mode = profile.mode_for(frame.width, frame.height)
+    if mode is None:
+        return Failure(
+            "no_signal",
+            f"camera profile {profile.name} has no readout mode for {frame.width} x {frame.height}; add one with "
+            "vlc-rx calibrate shutter, or leave the camera to be estimated with --camera auto",
+        )
+    lens = geometry.lens_for(profile.lens, frame.width, frame.height) if profile.lens else None
+    tone = DEFAULT_TONE if profile.tone == "auto" else profile.tone
+    exposure_s = meta.exposure_s or mode.exposure_s or 5 * mode.line_delay_s
+    return FrameCamera(profile.name, mode.line_delay_s, exposure_s, lens, tone)
+
+
+def known_lens(frame: Frame, options: ReceiverOptions) -> Lens | None:
+    """Lens from the matching camera profile, or None."""
+    known = known_camera(frame, options)
+    return known.lens if isinstance(known, FrameCamera) else None
+
+
+def propose_cameras(
+    cache: FrameCache, corners: FloatArray, options: ReceiverOptions, n_columns: int
+) -> Generator[FrameCamera, None, Failure]:
+    """Propose cameras of a frame, likeliest first; returns the reason if there are no others.
+
+    Args:
+        cache: the picture.
+        corners: (4, 2) of the screen.
+        options: screens.
+        n_columns: number of columns of the screen.
+    """
+    unknown = FrameCamera(None, float("nan"), float("nan"), None, DEFAULT_TONE)
+    frame, timer = cache.frame, cache.timer
+    context = FrameContext(cache, corners, unknown, options.screens)
+    profiles = context.sample_columns(n_columns)
+    with timer("blind"):
+        strips = _strips(context, profiles)
+    # A picture does not show the slot rate: the fastest screen represents all with the same packet length.
+    screens = sorted(options.screens, key=lambda screen: -screen.slot_rate_hz)
+    with timer("blind"):
+        hypotheses = propose(strips, screens, frame.metadata.exposure_s, may_bend=frame.mosaic is None)
+    for hypothesis in sorted(hypotheses, key=lambda h: (-h.score, h.rows_per_slot, h.reversed)):
+        screen = next(s for s in screens if s.packet_slots == hypothesis.packet_slots)
+        yield estimated_camera(hypothesis, screen.slot_rate_hz, frame)
+    return Failure("no_signal", why_not(strips))
+
+
+def estimated_camera(hypothesis: CameraHypothesis, slot_rate_hz: float, frame: Frame) -> FrameCamera:
+    """Camera from an estimate, for slots of a known rate."""
+    return FrameCamera(
+        profile=None,
+        line_delay_s=1 / (hypothesis.rows_per_slot * slot_rate_hz),
+        exposure_s=hypothesis.exposure_slots / slot_rate_hz,
+        lens=lens_of(hypothesis.curvature, frame.width, frame.height),
+        tone=DEFAULT_TONE,
+        reversed=hypothesis.reversed,
+        estimated=summary(hypothesis, slot_rate_hz),
+        hypothesis=hypothesis,
+    )
+
+
+def relabelled_camera(camera: FrameCamera, screen: ScreenProfile, frame: Frame) -> FrameCamera:
+    """Convert an estimated camera to the slot rate of a screen, since a picture only shows rows per slot."""
+    hypothesis, rate = camera.hypothesis, screen.slot_rate_hz
+    if hypothesis is None:
+        return camera
+    stated = (frame.metadata.exposure_s or 0.0) * rate
+    if hypothesis.packet_slots != screen.packet_slots:
+        exposure_slots = stated or hypothesis.exposure_slots
+        hypothesis = replace(hypothesis, packet_slots=screen.packet_slots, exposure_slots=exposure_slots)
+    return estimated_camera(replace(hypothesis, stated_exposure_slots=stated), rate, frame)
+
+
+def settle(context: FrameContext, acquisition: Acquisition, reception: Reception) -> tuple[FrameCamera, float]:
+    """Fit an estimated camera to decoded slots; also return the largest shift of the clock, slots."""
+    camera, screen, frame = context.camera, acquisition.screen, context.frame
+    if camera.hypothesis is None:
+        return camera, 0.0
+    with context.timer("blind"):
+        clock = reception.clock
+        found, moved_slots = settle_hypothesis(
+            _strips(context, acquisition.profiles),
+            camera.hypothesis,
+            clock,
+            clock.on_grid(reception.posteriors.lit),
+            screen.light_spread,
+            may_bend=frame.mosaic is None,
+        )
+    return estimated_camera(found, screen.slot_rate_hz, frame), moved_slots
+
+
+def _strips(context: FrameContext, profiles: RowProfiles) -> Strips:
+    """Convert row profiles to strips in order of time."""
+    frame, outlines = context.frame, context.outlines(len(profiles.light))
+    x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
+    return strips_of(profiles, x[:, ::-1] if context.camera.reversed else x, frame.width, frame.height)
