@@ -41,7 +41,7 @@ def easy() -> Trial:
 
 def case_of(trial: Trial, **changes: Any) -> Case:
     case = Case(source=(trial.frame,), options=trial.options(), about={}, truth=trial.truth, corners=trial.corners)
-    return replace(case, trial=trial, **changes)
+    return replace(case, trials=(trial,), **changes)
 
 
 # Ways.
@@ -302,18 +302,40 @@ def test_a_scenario_writes_table_and_journal(tmp_path: Path) -> None:
     assert (tmp_path / "phones.journal.jsonl").read_text().count("\n") == 1
 
 
-@pytest.mark.parametrize("clip", [{}, {"cameras": ["video-1080p"], "n_frames": 2}])
-def test_drawn_captures_are_saved_with_all_that_is_known(clip: dict[str, Any], tmp_path: Path) -> None:
-    point = {"screens": ["paper-8k65"], "exposure_slots": [3.0, 3.0], "width_px": 160, **clip}
+@pytest.mark.parametrize(
+    ("more", "files"),
+    [
+        ({}, ["3-slots-2-0-0.jpg"]),
+        ({"cameras": ["video-1080p"], "n_frames": 2}, ["3-slots-2-0-0.mp4"]),
+        ({"photos": 2, "text_bytes": 6}, ["3-slots-2-0-0-0.jpg", "3-slots-2-0-0-1.jpg"]),
+    ],
+)
+def test_drawn_captures_are_saved_with_all_that_is_known(
+    more: dict[str, Any], files: list[str], tmp_path: Path
+) -> None:
+    point = {"screens": ["paper-8k65"], "exposure_slots": [3.0, 3.0], "width_px": 160, **more}
     task = {"draw": "people", "ways": ["bound"], "seed": 2, "number": 0, "folder": str(tmp_path), "cae": None}
     (record,) = do({**task, "label": "3 slots", "point": point, "save": str(tmp_path)})
-    (known,) = (json.loads(path.read_text()) for path in tmp_path.glob("3-slots-2-0-0.case.json"))
+    known = json.loads((tmp_path / "3-slots-2-0-0.case.json").read_text())
+    assert known["files"] == files
     assert record["about"]["exposure_slots"] == pytest.approx(3)
-    assert (record["ways"]["bound"]["score"]["error_free"] > 0) == (not clip)
-    truth = json.loads((tmp_path / "3-slots-2-0-0.truth.json").read_text())
-    assert truth["corners_sensor_px"]
-    assert truth["camera"]["exposure_s"] == pytest.approx(3 / 8650, rel=1e-3)
+    assert (record["ways"]["bound"]["score"]["error_free"] > 0) == ("n_frames" not in more)
+    for file in files:
+        truth = json.loads((tmp_path / file).with_suffix(".truth.json").read_text())
+        assert truth["corners_sensor_px"]
+        assert truth["camera"]["exposure_s"] == pytest.approx(3 / 8650, rel=1e-3)
     assert run(known["named"]) in (ExitCode.OK, ExitCode.NOT_RECEIVED)
+
+
+@pytest.mark.parametrize("camera", [{}, {"cameras": ["phone-video"], "n_frames": 3}])
+def test_texts_that_arrive_are_counted(camera: dict[str, Any], tmp_path: Path) -> None:
+    """Easy captures of a screen that sends a text."""
+    easy = {"exposure_slots": [0.6, 0.6], "readout_s": [0.03, 0.03], "aim": 0.0, "lighted": 0.0, "width_px": 600}
+    point = {"screens": ["data-8k65"], "text_bytes": 4, **easy, **camera}
+    task = {"draw": "people", "ways": ["camera and corners given"], "seed": 2, "number": 1, "cae": "never"}
+    (record,) = do({**task, "folder": str(tmp_path), "label": "", "point": point})
+    (row, *_) = measures.rows([record], task["ways"], ("n", "texts", "texts_wrong"))
+    assert (row["texts"], row["texts_wrong"]) == (1, 0)
 
 
 def test_packets_of_earlier_journals_are_in_the_bins(tmp_path: Path) -> None:
@@ -372,7 +394,7 @@ def test_a_checkout_that_breaks_off_is_told(tmp_path: Path) -> None:
 
 def test_frames_without_data_are_compared_as_a_clip(tmp_path: Path) -> None:
     case = next(iter(draw_nodata(Place(3, 0, {"n_frames": 3}, tmp_path))))
-    path = cases.write_case(case, tmp_path / "case")
+    (path,) = cases.write_case(case, tmp_path / "case")
     assert len(list(open_source(path))) == len(case.source) == 3
 
 

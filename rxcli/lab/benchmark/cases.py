@@ -6,10 +6,11 @@ import os
 import shutil
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import lru_cache
+from itertools import chain
 from multiprocessing.connection import Connection
 from pathlib import Path
 from time import perf_counter, process_time
@@ -21,9 +22,10 @@ import numpy as np
 
 from rxcli.ingest import open_source
 from rxcli.lab.benchmark.media import bare_decode
-from rxcli.lab.benchmark.trial import Trial
+from rxcli.lab.benchmark.trial import SOURCE, Trial, write_still
 from rxcli.lab.benchmark.yardsticks import bound_result, paper_result
-from rxcli.lab.simulate.files import write_dng, write_video
+from rxcli.lab.simulate.files import write_video
+from rxcli.link.collector import Collector, PhotoCollector
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.outputs import write_whole
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile
@@ -48,8 +50,8 @@ _MIN_SHIFTED = 2
 class Case:
     """One scene or clip as a receiver gets it, with what is known of it."""
 
-    #: Frames in memory, or a file.
-    source: tuple[Frame, ...] | Path
+    #: Frames in memory, a file, or files of photographs that are taken of one transmission.
+    source: tuple[Frame, ...] | Path | tuple[Path, ...]
     options: ReceiverOptions
     #: Rows of the table that count this case, beside the row of all cases.
     groups: tuple[str, ...] = ()
@@ -65,31 +67,49 @@ class Case:
     corners: FloatArray | None = None
     #: With screen, camera and corners named, as far as a perfect calibration knows them.
     named: ReceiverOptions | None = None
-    #: The simulated frame, for the bound and the paper's pipeline.
-    trial: Trial | None = None
+    #: The text that the screen sends.
+    text: str | None = None
+    #: The simulated photographs, for the bound and the paper's pipeline.
+    trials: tuple[Trial, ...] = ()
 
     def frames(self) -> Iterable[Frame]:
         """The frames in order of time."""
-        return open_source(self.source) if isinstance(self.source, Path) else self.source
+        return chain.from_iterable(self._sources())
+
+    def receive(
+        self, options: ReceiverOptions, changed: Callable[[Frame], Frame] | None = None
+    ) -> Iterator[FrameResult]:
+        """The results of all sources, photographs numbered as the frames of a clip."""
+        sources = self._sources()
+        for number, frames in enumerate(sources):
+            for result in receive(map(changed, frames) if changed else frames, options):
+                yield result if len(sources) == 1 else replace(result, frame=number)
+
+    def _sources(self) -> list[Iterable[Frame]]:
+        sources = (self.source,) if isinstance(self.source, Path) else self.source
+        files = [open_source(source) for source in sources if isinstance(source, Path)]
+        return list(files) or [sources]  # type: ignore[list-item]
 
 
-def write_case(case: Case, stem: Path) -> Path:
-    """Write a case as a file of this stem, its truth beside it; returns where."""
+def write_case(case: Case, stem: Path) -> list[Path]:
+    """Write a case as files of this stem, their truth beside them; returns where."""
     stem.parent.mkdir(parents=True, exist_ok=True)
-    path = _written(case, stem)
-    truth = case.whole_truth or case.truth
-    if truth is not None:
-        write_whole(truth_path(path), msgspec.json.encode(truth))
-    return path
+    paths = list(_written(case, stem))
+    known: Sequence[Any] = [trial.capture.truth for trial in case.trials]
+    truths = known or [case.whole_truth or case.truth] * len(paths)
+    for path, truth in zip(paths, truths, strict=True):
+        if truth is not None:
+            write_whole(truth_path(path), msgspec.json.encode(truth))
+    return paths
 
 
-def arguments_of(path: Path, options: ReceiverOptions) -> list[str]:
+def arguments_of(paths: Sequence[Path], options: ReceiverOptions) -> list[str]:
     """The arguments of `vlc-rx` that receive a written case with some options; profiles go beside the file."""
-    arguments = ["decode", str(path), "--json", "-", "--quiet", "--truth", "auto", "--cae", options.cae]
+    arguments = ["decode", *map(str, paths), "--json", "-", "--quiet", "--truth", "auto", "--cae", options.cae]
     named: list[ScreenProfile | CameraProfile] = list(options.cameras if options.force_camera else ())
     named += () if options.screens == ReceiverOptions().screens else options.screens
     for number, profile in enumerate(named):
-        toml = path.with_suffix(f".{number}.toml")
+        toml = paths[0].with_suffix(f".{number}.toml")
         write_whole(toml, dump_profile(profile))
         arguments += [f"--{profile.kind}", str(toml)]
     if options.corners is not None:
@@ -97,44 +117,42 @@ def arguments_of(path: Path, options: ReceiverOptions) -> list[str]:
     return arguments + [part for name in SKIPS if name not in options.skip for part in ("--no-skip", name)]
 
 
-def _written(case: Case, stem: Path) -> Path:
-    """The case's file: a copy, a clip of several frames, a JPEG or DNG where one was simulated, or else a PNG."""
-    if isinstance(case.source, Path):
-        return Path(shutil.copyfile(case.source, stem.with_suffix(case.source.suffix)))
-    frame, trial = case.source[0], case.trial
-    if len(case.source) > 1:
-        path = stem.with_suffix(".mp4")
-        pictures = (cv2.cvtColor(np.asarray(each.pixels), cv2.COLOR_GRAY2RGB) for each in case.source)
-        write_video(pictures, path, "h264", 1 / (case.source[1].time_s - frame.time_s))
-        return path
-    if trial is None or frame is not trial.frame:
+def _written(case: Case, stem: Path) -> Iterator[Path]:
+    """The case's files: copies, a clip of several frames, a DNG where a mosaic was simulated, or else a PNG."""
+    sources = (case.source,) if isinstance(case.source, Path) else case.source
+    frames = [source for source in sources if not isinstance(source, Path)]
+    scene = case.trials[0].capture.scene if case.trials else None
+    for number, source in enumerate(sources):
+        if isinstance(source, Path):
+            turn = f"-{number}" if len(sources) > 1 else ""
+            yield Path(shutil.copyfile(source, stem.with_name(f"{stem.name}{turn}{source.suffix}")))
+    if len(frames) > 1:
+        pictures = (cv2.cvtColor(np.asarray(each.pixels), cv2.COLOR_GRAY2RGB) for each in frames)
+        write_video(pictures, stem.with_suffix(".mp4"), "h264", 1 / (frames[1].time_s - frames[0].time_s))
+        yield stem.with_suffix(".mp4")
+    elif frames and (scene is None or frames[0] is not case.trials[0].frame):
         # A picture that was changed after its simulation is stored anew, without metadata.
-        path = stem.with_suffix(".png")
-        write_whole(path, cv2.imencode(".png", np.asarray(frame.pixels))[1].tobytes())
-    elif trial.capture.scene.is_mosaic:
-        path = stem.with_suffix(".dng")
-        write_dng(trial.capture.raw, trial.capture.scene, path)
-    else:
-        path = stem.with_suffix(".jpg")
-        write_whole(path, trial.capture.jpeg)
-    return path
+        write_whole(stem.with_suffix(".png"), cv2.imencode(".png", np.asarray(frames[0].pixels))[1].tobytes())
+        yield stem.with_suffix(".png")
+    elif frames and scene is not None:
+        yield write_still(case.trials[0].capture, stem)
 
 
 def _with_options(**changes: Any) -> Way:
-    return lambda case: receive(case.frames(), replace(case.options, **changes))
+    return lambda case: case.receive(replace(case.options, **changes))
 
 
 def _on_two_threads(case: Case) -> Iterator[FrameResult]:
     with threads(2):
-        yield from receive(case.frames(), case.options)
+        yield from case.receive(case.options)
 
 
 RECEIVER, OTHER_KERNEL = "receiver", "another kernel"
 #: Name of a way -> how it receives a case. `OTHER_KERNEL` is `RECEIVER` in another process.
 WAYS: dict[str, Way] = {
     RECEIVER: _with_options(),
-    "corners given": lambda case: receive(case.frames(), replace(case.options, corners=case.corners)),
-    "camera and corners given": lambda case: receive(case.frames(), case.named or case.options),
+    "corners given": lambda case: case.receive(replace(case.options, corners=case.corners)),
+    "camera and corners given": lambda case: case.receive(case.named or case.options),
     "frames one by one": _with_options(skip=frozenset(SKIPS) - {"tracking"}),
     "searched": _with_options(corners=None),
     "no auto-encoder": _with_options(cae="never"),
@@ -142,10 +160,10 @@ WAYS: dict[str, Way] = {
     **{f"no skip of {name}": _with_options(skip=frozenset(SKIPS) - {name}) for name in SKIPS},
     "no skip at all": _with_options(skip=frozenset()),
     "two threads": _on_two_threads,
-    "grey levels": lambda case: receive(map(with_grey_levels, case.frames()), case.options),
-    "cropped by a row": lambda case: receive(map(without_first_row, case.frames()), cropped_options(case.options)),
-    "bound": lambda case: [] if case.trial is None else [bound_result(case.trial)],
-    "paper": lambda case: [] if case.trial is None else [paper_result(case.trial)],
+    "grey levels": lambda case: case.receive(case.options, with_grey_levels),
+    "cropped by a row": lambda case: case.receive(cropped_options(case.options), without_first_row),
+    "bound": lambda case: map(bound_result, case.trials),
+    "paper": lambda case: map(paper_result, case.trials),
 }
 
 
@@ -170,7 +188,7 @@ def received(case: Case, way: str) -> Record:
     """
     if way == OTHER_KERNEL:
         # A trial stays here: its simulation is large, and no receiver looks at it.
-        _other_kernel().send(replace(case, trial=None))
+        _other_kernel().send(replace(case, trials=()))
         return dict(_other_kernel().recv())
     scorer = None if case.truth is None else Scorer(case.truth)
     results: list[FrameResult] = []
@@ -183,6 +201,7 @@ def received(case: Case, way: str) -> Record:
         except Exception as error:
             problems.append(f"{type(error).__name__}: {error}")
     cpu_s, wall_s = process_time() - start, perf_counter() - wall
+    texts = list(_texts(results, case)) if case.text is not None else []
     problems += [f"{w.category.__name__}: {w.message} ({Path(w.filename).name}:{w.lineno})" for w in caught]
     problems += [problem for result in results for problem in nonsense(result)]
     stages_ms = sum((Counter(result.timing_ms) for result in results), Counter[str]())
@@ -195,6 +214,7 @@ def received(case: Case, way: str) -> Record:
         "problems": list(dict.fromkeys(problems)),
         "score": None if scorer is None else asdict(scorer.score()),
         "packets": [packet for result in results for packet in _packets(result, case)],
+        "texts": [text == case.text for text in texts],
         **(_found(results[0], case) if results else {"status": "exception"}),
     }
 
@@ -232,6 +252,18 @@ def _packets(result: FrameResult, case: Case) -> Iterator[Record]:
             place = {"frame": result.frame, "column": column.column, "payload": packet.payload}
             features = packet.confidence_features
             yield {**place, "confidence": packet.confidence, "bit_errors": wrong, "evidence": features}
+
+
+def _texts(results: Sequence[FrameResult], case: Case) -> Iterator[str | None]:
+    """The messages that the link layer makes of the results, photographs together."""
+    several = isinstance(case.source, tuple)
+    collector = (PhotoCollector if several else Collector)(case.options.screens)
+    for number, result in enumerate(results):
+        # Clips are collected with the source's end, as their last frames bring what was left.
+        added = collector.add(replace(result, source=SOURCE))
+        last = number == len(results) - 1 and not several
+        for message in (collector.finish(added) if last else added).messages:
+            yield message.text
 
 
 def _found(result: FrameResult, case: Case) -> Record:

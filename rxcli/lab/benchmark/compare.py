@@ -75,7 +75,7 @@ def compare(tasks: Sequence[Task], rival: Path, folder: Path, repeats: int, tick
             stem = (folder / f"{task['draw']}-{task['seed']}-{len(jobs)}").resolve()
             jobs.append(arguments_of(write_case(case, stem), case.options))
             groups = [*filter(None, [task["label"]]), *case.groups]
-            records.append({"about": {"file": jobs[-1][1]}, "has_data": case.has_data, "groups": groups, "ways": {}})
+            records.append({"about": {"file": stem.name}, "has_data": case.has_data, "groups": groups, "ways": {}})
     turns: dict[str, list[list[Record]]] = {way: [] for way in WAYS}
     for _ in range(repeats):
         for way, checkout in zip(WAYS, (rival, CHECKOUT), strict=True):

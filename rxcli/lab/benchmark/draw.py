@@ -18,7 +18,7 @@ import numpy as np
 
 from rxcli.lab.benchmark.cases import Case
 from rxcli.lab.benchmark.media import Medium, camera_path
-from rxcli.lab.benchmark.trial import SOURCE, Trial, corners_on_picture, simulate_trial
+from rxcli.lab.benchmark.trial import SOURCE, Trial, corners_on_picture, simulate_trial, write_still
 from rxcli.lab.simulate.capture import Recording, prepare
 from rxcli.lab.simulate.files import write_video
 from rxcli.lab.simulate.isp import Isp
@@ -29,6 +29,7 @@ from rxcli.lab.simulate.population import Population, placed
 from rxcli.lab.simulate.scenes import Scene, draw_weight, preset, random_scene
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.lab.simulate.truth import build_camera_profile
+from rxcli.link.encoder import message
 from rxcli.options import ReceiverOptions, receiver_options
 from rxcli.profiles import ScreenProfile, load_profile, shipped_profiles
 from rxcli.protocol import payload_bits
@@ -66,30 +67,51 @@ def _case(trial: Trial, options: ReceiverOptions, *groups: str, **about: Any) ->
     scene, frames = trial.capture.scene, (trial.frame,)
     about |= {"screen": scene.screen.name, "camera": scene.camera_name, "rows_per_slot": scene.rows_per_slot}
     about["picture"] = scene.picture if isinstance(scene.picture, str) else "drawn"
-    known: dict[str, Any] = {"truth": trial.truth, "whole_truth": trial.capture.truth, "corners": trial.corners}
-    return Case(source=frames, options=options, groups=groups, about=about, trial=trial, **known)
+    known: dict[str, Any] = {"truth": trial.truth, "corners": trial.corners, "trials": (trial,)}
+    return Case(source=frames, options=options, groups=groups, about=about, **known)
 
 
 # Pictures and clips as people take them.
 
 
+#: Photographs of one transmission follow each other so often.
+_PHOTOS_HZ = 0.4
+_LETTERS = tuple("abcdefghijklmnopqrstuvwxyz 0123456789")
+
+
 def draw_people(at: Place) -> Iterator[Case]:
-    """A capture of a population, its camera unknown; point: fields of `Population`."""
-    population = msgspec.convert(at.point, Population)
-    scene, kind = population.draw(np.random.default_rng([at.seed, at.number, 31]))
-    group = "dark" if kind in DARK_KINDS else "bright"
+    """Files of a population, their camera unknown.
+
+    Point: fields of `Population`; `photos`, taken one after the other; `text_bytes` of a text that the screen sends.
+    """
+    point: dict[str, Any] = {"photos": 1, "text_bytes": 0, **at.point}
+    photos, text_bytes = point.pop("photos"), point.pop("text_bytes")
+    rng = np.random.default_rng([at.seed, at.number, 31])
+    scene, kind = msgspec.convert(point, Population).draw(rng)
+    text = "".join(rng.choice(_LETTERS, text_bytes)) if text_bytes else None
+    if text is not None:
+        start_slot = rng.uniform(0, 1e5)
+        scene = replace(scene, labels=message(text), start_slot=start_slot, w=5)
+    options = ReceiverOptions(soft_bits=text is not None)
+    groups = ("dark" if kind in DARK_KINDS else "bright",)
     about = {"kind": kind, "exposure_slots": scene.exposure_s * scene.screen.slot_rate_hz}
-    if scene.n_frames == 1:
-        trial = simulate_trial(scene, at.flat, oracle=at.oracle)
-        case = _case(trial, ReceiverOptions(), group, **about)
-        yield replace(case, named=trial.options())
+    about["readout_ms"] = 1e3 * scene.sensor.line_delay_s * scene.sensor.height
+    if scene.n_frames > 1:
+        recording, rate = prepare(scene, at.flat), _bit_rate(rng, scene, _BITS_PER_PIXEL)
+        with filmed(recording, [("h264", "veryfast", rate)]) as (path,):
+            clip = _clip(recording, path, True, *groups)
+            named = replace(clip.options, corners=clip.corners, soft_bits=options.soft_bits)
+            yield replace(clip, options=options, named=named, about=clip.about | about, text=text)
         return
-    recording = prepare(scene, at.flat)
-    rng = np.random.default_rng([at.seed, at.number, 37])
-    with filmed(recording, [("h264", "veryfast", _bit_rate(rng, scene, _BITS_PER_PIXEL))]) as (path,):
-        case = _clip(recording, path, True, group)
-        known = replace(case.options, corners=case.corners)
-        yield replace(case, options=ReceiverOptions(), named=known, about=case.about | about)
+    recording = prepare(replace(scene, n_frames=photos, frame_rate_hz=_PHOTOS_HZ), at.flat)
+    trials = [Trial(recording.frame(number, oracle=at.oracle, threads=1), number) for number in range(photos)]
+    with TemporaryDirectory() as folder:
+        paths = tuple(write_still(trial.capture, Path(folder) / str(trial.index)) for trial in trials)
+        case = _case(trials[0], options, *groups, **about)
+        truth = msgspec.convert(recording.truth("photographs"), Truth, str_keys=True)
+        named = trials[0].options(soft_bits=options.soft_bits)
+        case = replace(case, source=paths if photos > 1 else paths[0], truth=truth, named=named, text=text)
+        yield replace(case, trials=tuple(trials))
 
 
 # Phones that nobody has measured.

@@ -208,6 +208,8 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "of_shown": lambda g: len(g.shown()),
     # Columns that are reported as counted from the left are not numbered wrong.
     "numbered_wrong": lambda g: sum(bool(r.get("shift") and r["numbered"]) for r in g.receptions),
+    "texts": lambda g: sum(any(texts) for texts in g.values("texts")),
+    "texts_wrong": lambda g: sum(texts.count(False) for texts in g.values("texts")),
     "exact": lambda g: sum(g.values("exact")),
     "s_median": _transfers("seconds", median),
     "s_worst": _transfers("seconds", max),

@@ -111,10 +111,13 @@ def save(case: Case, stem: Path, known: Record) -> None:
 
     The arguments under "named" name screen, camera and corners.
     """
-    path = write_case(case, stem)
-    known |= {"file": path.name, "corners": None if case.corners is None else case.corners.tolist()}
-    known["arguments"] = arguments_of(path, case.options)
-    known["named"] = None if case.named is None else arguments_of(path, case.named)
+    paths = write_case(case, stem)
+    known |= {
+        "files": [path.name for path in paths],
+        "corners": None if case.corners is None else case.corners.tolist(),
+    }
+    known["arguments"] = arguments_of(paths, case.options)
+    known["named"] = None if case.named is None else arguments_of(paths, case.named)
     write_whole(stem.with_name(stem.name + ".case.json"), json.dumps(known) + "\n")
 
 

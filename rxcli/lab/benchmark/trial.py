@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 
 from rxcli.lab.simulate.capture import Capture, simulate_frame
+from rxcli.lab.simulate.files import write_dng
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.options import ReceiverOptions
+from rxcli.outputs import write_whole
 from rxcli.profiles import CameraProfile
 from rxcli.results.truth import Truth
 from rxcli.types import FloatArray, Frame, Metadata, Mosaic
@@ -68,6 +71,16 @@ class Trial:
 def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False, threads: int = 1) -> Trial:
     """Simulate one frame of `scene`; equal seeds give equal pixels."""
     return Trial(simulate_frame(scene, np.random.default_rng(seed), oracle=oracle, threads=threads))
+
+
+def write_still(capture: Capture, stem: Path) -> Path:
+    """Write a photograph as a JPEG or DNG of this stem; returns where."""
+    path = stem.with_name(stem.name + (".dng" if capture.scene.is_mosaic else ".jpg"))
+    if capture.scene.is_mosaic:
+        write_dng(capture.raw, capture.scene, path)
+    else:
+        write_whole(path, capture.jpeg)
+    return path
 
 
 def corners_on_picture(view: View, corrected: bool) -> FloatArray:

@@ -176,7 +176,7 @@ class Scene:
 
 
 #: Names of presets, in order.
-PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-plain")
+PRESETS = ("xs10-still", "video-4k", "video-1080p", "phone-corrected", "phone-plain", "phone-video")
 
 
 @lru_cache(maxsize=1)
@@ -236,7 +236,7 @@ def with_fields(part: Part, table: Mapping[str, Any], place: str = "") -> Part:
 
 def random_scene(rng: np.random.Generator) -> Scene:
     """A scene that a person might meet: any preset, screen, picture, pose, light and exposure."""
-    base = preset(str(rng.choice(list(PRESETS))), str(rng.choice(["paper-8k65", "paper-17k3", "paper-34k6"])))
+    base = preset(str(rng.choice(PRESETS[:5])), str(rng.choice(["paper-8k65", "paper-17k3", "paper-34k6"])))
     exposure_slots = float(rng.choice([0.25, 0.5, 1.0, 1.5, 2.0])) * rng.uniform(0.8, 1.2)
     exposure_s = max(exposure_slots / base.screen.slot_rate_hz, 1 / 32000)
     upside_down = rng.random() < 0.15
