@@ -23,12 +23,13 @@ _MAX_SCANS = 100
 _PADDING = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
 
 
-def decode_luma(data: Any, source: object) -> NDArray[np.uint8]:
+def decode_luma(data: Any, source: object, at_once: int = 1) -> NDArray[np.uint8]:
     """Luma (height, width) of a JPEG picture, as stored (never turned).
 
     Args:
         data: bytes-like.
         source: names the picture in messages.
+        at_once: pictures that share the memory.
 
     Raises:
         InputError: truncated (with the number of rows), damaged, or no JPEG.
@@ -40,7 +41,7 @@ def decode_luma(data: Any, source: object) -> NDArray[np.uint8]:
     except _FAULTS:
         raise InputError(f"{source}: the JPEG header is damaged or cut", "copy the file again") from None
     held, is_one_scan = _frame_of(data)
-    check_size(source, width, height, held, len(data))
+    check_size(source, width, height, at_once * held, at_once * len(data))
     if not is_one_scan and bytes(data).count(b"\xff\xda") > _MAX_SCANS:
         raise InputError(f"{source}: the JPEG has more than {_MAX_SCANS} scans", "the file is damaged or a bomb")
     try:

@@ -22,7 +22,11 @@ RAW_SUFFIXES = frozenset({
     ".srw", ".x3f", ".3fr", ".fff", ".iiq", ".erf", ".mef", ".mos", ".mrw", ".kdc", ".dcr", ".rwl", ".gpr",
 })
 # fmt: on
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".3gp"})
+#: Of JPEGs in a row: each begins like a photograph.
+MJPEG_SUFFIXES = frozenset({".mjpeg", ".mjpg"})
+VIDEO_SUFFIXES = MJPEG_SUFFIXES | {
+    *(".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".3gp")
+}
 #: Suffixes, lower case with their dot, of the files that are looked at in folders.
 KNOWN_SUFFIXES = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
 
@@ -103,6 +107,8 @@ def read_bytes(path: Path, size: int = -1) -> bytes:
 
 def sniff(head: bytes, suffix: str) -> Kind | None:
     """The kind of a file that starts with `head`; None if neither bytes nor `suffix` identify it."""
+    if suffix in MJPEG_SUFFIXES:
+        return "video"
     by_name: Kind | None = "raw" if suffix in RAW_SUFFIXES else "video" if suffix in VIDEO_SUFFIXES else None
     return next((kind for at, starts, kind in _MAGIC if head.startswith(starts, at)), by_name)
 

@@ -11,7 +11,7 @@ import os
 from collections import deque
 from collections.abc import Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,30 +20,44 @@ from numpy.typing import NDArray
 
 from rxcli.errors import InputError, reason_of
 from rxcli.ingest.ahead import read_ahead
+from rxcli.ingest.damage import WholeFrames
+from rxcli.ingest.ends import is_cut
 from rxcli.ingest.metadata import clip_metadata
 from rxcli.ingest.orientation import orientation_of_turn
-from rxcli.ingest.sniff import check_size
+from rxcli.ingest.sniff import MAX_BYTES, check_size, damage_explained
+from rxcli.ingest.times import FrameTimes
 from rxcli.types import Frame, Metadata
 
 #: ITU-T H.273: samples use 16..235 of 8 bits, or all of them (FFmpeg's AVCOL_RANGE_JPEG).
 _FULL_RANGE = 2
 _LIMITED_BLACK, _LIMITED_WHITE = 16, 235
-#: A clip is cut where its last frame starts more than this many frames before its stated end; times are rounded.
+#: FFmpeg's orders of fields whose lower one is taken first (AV_FIELD_BB, AV_FIELD_TB).
+_LOWER_FIRST = (3, 4)
+#: Columns whose rows are compared to see whether a frame is two fields.
+_N_COMPARED = 64
+#: Of what a clip states, so much may be missing at its end, in frames; times are rounded.
 _END_TOLERANCE = 1.5
 #: Frame rates that a stream may state, and the one that is taken where it states none.
 _RATES_HZ, _USUAL_RATE_HZ = (1.0, 1000.0), 30.0
-_MJPEG_THREADS = min(4, os.cpu_count() or 1)
+#: Pictures of MJPEG that are decoded or wait at most, one in each thread and as many before it.
+_MJPEG_AT_ONCE = 8
+_MJPEG_THREADS = min(_MJPEG_AT_ONCE // 2, os.cpu_count() or 1)
 #: Threads of the other decoders: one more than FFmpeg takes, for theirs wait for one another.
 _DECODER_THREADS = min((os.cpu_count() or 1) + 2, 16)
-#: Decoders hold some ten frames for others to refer to, and one in every thread.
-_BYTES_A_PIXEL = 1.5 * (10 + _DECODER_THREADS)
-_TS_SYNC = 0x47
+#: Frames that a decoder of large pictures and the receiver hold, besides one in each thread but the first.
+_N_HELD = 8
+#: Decoders make rows and columns up to multiples of it.
+_ALIGNED = 64
+#: Packets whose times are so far from those before, in seconds, are those of another clip that was joined.
+_JOINT_S = 1.0
 #: Times of a clip that are believed: a claim of more would be years.
 _MAX_S = 1e6
 #: FFmpeg opens this one file and nothing that it names: no other protocol, and containers only, no lists of files.
 _FILES_ONLY = {
     "protocol_whitelist": "file",
-    "format_whitelist": "mov,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,mjpeg,asf,flv",
+    "format_whitelist": "mov,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,mjpeg,mpjpeg,jpeg_pipe,asf,flv",
+    # Times that step back where clips were joined are no counter that ran over.
+    "correct_ts_overflow": "0",
 }
 
 
@@ -51,22 +65,28 @@ _FILES_ONLY = {
 class _Progress:
     """Progress of reading, which shows at the end whether the clip was complete."""
 
-    n_packets: int = 0
+    times: FrameTimes = field(default_factory=FrameTimes)
     last_time_s: float = 0.0
-    #: Time of the last frame that was given one; None before any.
-    stamp_s: float | None = None
+    #: Where the last packet ends that the container gave.
+    end_s: float = 0.0
     #: Time of the last whole frame before the first fault.
     broken_at_s: float | None = None
     n_damaged: int = 0
+    #: Why the first damaged frame is, where that is known.
+    reason: str = ""
     #: Whether the file ends within a packet.
     cut: bool = False
-    #: What a frame's time claims to be, where that is not believed.
+    #: What the file claims of its frames and is not believed.
     doubt: str | None = None
+    #: Whether the container has times of its own.
+    has_times: bool = True
+    #: Whether frames are two fields, one after the other.
+    has_fields: bool = False
 
-    def damage(self) -> None:
+    def damage(self, reason: str = "") -> None:
         self.n_damaged += 1
         if self.broken_at_s is None:
-            self.broken_at_s = self.last_time_s
+            self.broken_at_s, self.reason = self.last_time_s, reason
 
 
 def read_video(path: Path) -> Iterator[Frame]:
@@ -80,22 +100,43 @@ def read_video(path: Path) -> Iterator[Frame]:
 
 def _read(path: Path) -> Generator[Frame, None, None]:
     import av
+    from av.format import Flags
 
     progress = _Progress()
     try:
         # Without a protocol, FFmpeg takes what stands before a colon for one.
-        container = av.open(f"file:{os.path.abspath(path)}", options=_FILES_ONLY)
+        container = av.open(f"file:{os.path.abspath(path)}", options=_FILES_ONLY, metadata_errors="replace")
     except (av.error.FFmpegError, ValueError, UnicodeError, OSError) as error:
         raise InputError(*_open_failure(path, error)) from None
     with container:
-        if not container.streams.video:
+        stream = _stream_of(container)
+        if stream is None:
             raise InputError(f"{path}: no video in it", "name a clip with pictures")
-        stream = container.streams.video[0]
         if stream.codec_context is None:
             raise InputError(f"{path}: its codec is unknown", "save it as H.264, HEVC or MJPEG")
-        check_size(path, stream.codec_context.width, stream.codec_context.height, _BYTES_A_PIXEL)
+        progress.has_times = not container.format.flags & Flags.no_timestamps.value
+        check_size(path, stream.codec_context.width, stream.codec_context.height, _N_HELD * _pixel_bytes(stream))
         yield from _frames(path, container, stream, progress)
         _check_whole(path, container, stream, progress)
+
+
+def _stream_of(container: Any) -> Any:
+    """The stream of the clip's pictures: no cover, no preview; None where there is none."""
+    from av.stream import Disposition
+
+    def merit(stream: Any) -> tuple[bool, int]:
+        codec = stream.codec_context
+        return stream.frames != 1, codec.width * codec.height if codec else 0
+
+    stills = Disposition.attached_pic | Disposition.still_image | Disposition.timed_thumbnails
+    moving = (stream for stream in container.streams.video if not stream.disposition & stills)
+    return max(moving, key=merit, default=None)
+
+
+def _pixel_bytes(stream: Any) -> float:
+    """Bytes a pixel of decoded frames."""
+    form = stream.codec_context.format
+    return float(form.padded_bits_per_pixel) / 8 if form else 1.5
 
 
 def _frames(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
@@ -108,42 +149,58 @@ def _frames(path: Path, container: Any, stream: Any, progress: _Progress) -> Ite
         yield replace(frame, index=index, metadata=replace(metadata, orientation=frame.metadata.orientation))
 
 
-def _packets(container: Any, stream: Any, progress: _Progress) -> Iterator[Any]:
-    """Whole packets with content, then one empty packet that asks the decoder for its last frames."""
+def _packets(container: Any, stream: Any, progress: _Progress) -> Iterator[tuple[Any, bool]]:
+    """Packets with content, and whether some of it is lost; then None, which asks the decoder for its last frames."""
+    before, has_gap = None, False
+    is_parsed = container.format.name == "mpegts"
+    for packet in _content(container, stream, progress):
+        if before is not None:
+            yield before, has_gap and not _is_joint(before, packet)
+        # FFmpeg's parser ends a packet where it finds the next one: what it says of that, it says of the one before.
+        has_gap = before is not None and before.is_corrupt if is_parsed else packet.is_corrupt
+        before = packet
+    progress.cut |= has_gap
+    if before is not None:
+        yield before, has_gap
+    yield None, False
+
+
+def _content(container: Any, stream: Any, progress: _Progress) -> Iterator[Any]:
+    """Packets with content up to the end or a fault."""
     import av
 
-    packets = container.demux(stream)
-    while True:
-        try:
-            packet = next(packets, None)
-        except av.error.FFmpegError:
-            progress.cut, packet = True, None
-        if packet is None or not packet.size:
-            yield None
-            return
-        if packet.is_corrupt:
-            progress.cut = True
-            continue
-        progress.n_packets += 1
-        yield packet
+    try:
+        for packet in container.demux(stream):
+            if packet.size:  # a camera that drops a frame writes an empty one
+                if packet.pts is not None:
+                    end_s = float((packet.pts + (packet.duration or 0)) * packet.time_base)
+                    progress.end_s = max(progress.end_s, end_s)
+                yield packet
+    except av.error.FFmpegError:
+        progress.cut = True
+
+
+def _is_joint(before: Any, packet: Any) -> bool:
+    """Whether a packet begins another clip, which was joined to that of the packet before."""
+    if before.dts is None or packet.dts is None:
+        return False
+    return not 0 <= (packet.dts - before.dts) * packet.time_base <= _JOINT_S
 
 
 def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
-    import av
-
     codec = stream.codec_context
-    codec.thread_type, codec.thread_count = "FRAME", _DECODER_THREADS
-    for packet in _packets(container, stream, progress):
-        try:
-            frames = codec.decode(packet)
-        except av.error.FFmpegError:
-            progress.damage()
-            continue
-        for frame in frames:
-            if frame.is_corrupt:
+    n_frames = int(MAX_BYTES / (_pixel_bytes(stream) * (codec.width + _ALIGNED) * (codec.height + _ALIGNED)))
+    n_threads = max(min(n_frames - _N_HELD + 1, _DECODER_THREADS), 1)
+    max_pixels = int(MAX_BYTES / (_pixel_bytes(stream) * (_N_HELD - 1 + n_threads)))
+    # HEVC's decoder passes over faults otherwise.
+    codec.options = {"max_pixels": str(max_pixels)} | ({"err_detect": "explode"} if codec.name == "hevc" else {})
+    whole = WholeFrames(codec, n_threads, n_frames - _N_HELD - n_threads)
+    for packet, has_gap in _packets(container, stream, progress):
+        for frame in whole.decode(packet, has_gap=has_gap):
+            if frame is None:
                 progress.damage()
             else:
-                yield _frame(path, frame, *_time_s(frame, stream, progress))
+                yield from _fields(_frame(path, frame, stream, progress), frame, stream, progress)
 
 
 def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
@@ -153,16 +210,17 @@ def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) 
     black, white = (_LIMITED_BLACK, _LIMITED_WHITE) if limited else (0, 255)
     waiting: deque[tuple[tuple[float, bool], Future[NDArray[np.uint8]]]] = deque()
     with ThreadPoolExecutor(_MJPEG_THREADS) as pool:
-        for packet in _packets(container, stream, progress):
+        for packet, _ in _packets(container, stream, progress):
             if packet is not None:
-                waiting.append((_time_s(packet, stream, progress), pool.submit(decode_luma, bytes(packet), path)))
+                picture = pool.submit(decode_luma, bytes(packet), path, at_once=_MJPEG_AT_ONCE)
+                waiting.append((_time_s(packet, stream, progress), picture))
             while len(waiting) > (_MJPEG_THREADS if packet is not None else 0):
                 (time_s, nominal), picture = waiting.popleft()
                 try:
                     pixels = picture.result()
                     yield Frame(pixels, str(path), 0, time_s, black=black, white=white, nominal_time=nominal)
-                except InputError:
-                    progress.damage()
+                except InputError as error:
+                    progress.damage(str(error).removeprefix(f"{path}: "))
 
 
 def _time_s(stamped: Any, stream: Any, progress: _Progress) -> tuple[float, bool]:
@@ -170,14 +228,12 @@ def _time_s(stamped: Any, stream: Any, progress: _Progress) -> tuple[float, bool
 
     That is taken where a file gives no time, or one that does not advance: zeros, or times that run backwards.
     """
-    own = float(stamped.pts * stream.time_base) if stamped.pts is not None and stream.time_base else None
+    is_stamped = stamped.pts is not None and stream.time_base and progress.has_times
+    own = float(stamped.pts * stream.time_base) if is_stamped else None
     if own is not None and abs(own) >= _MAX_S:
         progress.doubt = progress.doubt or f"a frame's time of {own:.6g} s"
         own = None
-    before = progress.stamp_s
-    nominal = before is not None and (own is None or own <= before)
-    progress.stamp_s = before + _frame_s(stream) if before is not None and nominal else (own or 0.0)
-    return progress.stamp_s, nominal
+    return progress.times.next(own, _frame_s(stream))
 
 
 def _frame_s(stream: Any) -> float:
@@ -188,15 +244,38 @@ def _frame_s(stream: Any) -> float:
     return 1 / _USUAL_RATE_HZ
 
 
-def _frame(path: Path, frame: Any, time_s: float, nominal: bool) -> Frame:
+def _frame(path: Path, frame: Any, stream: Any, progress: _Progress) -> Frame:
     """Convert a frame of FFmpeg, without its number and the metadata of the clip."""
+    time_s, nominal = _time_s(frame, stream, progress)
+    metadata = Metadata(orientation=orientation_of_turn(frame.rotation))
     if not _has_luma_plane(frame.format):
-        frame = frame.reformat(format="gray")
+        with damage_explained(f"{path}: pixels of {frame.format.name} cannot be read", "save it as H.264 or HEVC"):
+            frame = frame.reformat(format="bgr24") if frame.format.has_palette else frame  # else grey is rounded
+            frame = frame.reformat(format="gray")
     bits = frame.format.components[0].bits
     black, white = _levels(frame, bits)
     pixels = _plane(frame.planes[0], frame.width, frame.height, np.uint8 if bits == 8 else np.uint16)
-    metadata = Metadata(orientation=orientation_of_turn(frame.rotation))
     return Frame(pixels, str(path), 0, time_s, metadata, black=black, white=white, nominal_time=nominal)
+
+
+def _fields(frame: Frame, decoded: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
+    """The fields of a frame that is two, taken one after the other; else the frame.
+
+    Some cameras mark frames so whose rows are one picture: there, neighbouring rows are more alike than every other.
+    """
+    if not decoded.interlaced_frame:
+        yield frame
+        return
+    if not progress.has_fields:
+        some = frame.pixels[:, :: max(frame.width // _N_COMPARED, 1)].astype(np.int32)
+        progress.has_fields = bool(np.abs(some[1:] - some[:-1]).mean() > np.abs(some[2:] - some[:-2]).mean())
+    if not progress.has_fields:
+        progress.doubt = progress.doubt or "interlaced frames, since both fields of them show one instant"
+        yield frame
+        return
+    lower = int(stream.codec_context.field_order in _LOWER_FIRST)
+    yield replace(frame, pixels=frame.pixels[lower::2])
+    yield replace(frame, pixels=frame.pixels[1 - lower :: 2], time_s=frame.time_s + _frame_s(stream) / 2)
 
 
 def _levels(frame: Any, bits: int) -> tuple[float, float]:
@@ -209,74 +288,39 @@ def _levels(frame: Any, bits: int) -> tuple[float, float]:
 
 def _has_luma_plane(form: Any) -> bool:
     """Whether plane 0 is luma alone, in samples of the machine's own byte order."""
-    return not form.is_rgb and not form.is_big_endian and (form.is_planar or len(form.components) == 1)
+    is_luma = not form.is_rgb and not form.has_palette and (form.is_planar or len(form.components) == 1)
+    return is_luma and not form.is_big_endian and 8 <= form.components[0].bits <= 16
 
 
 def _plane(plane: Any, width: int, height: int, dtype: type[np.uint8] | type[np.uint16]) -> NDArray[Any]:
     """A read-only view (height, width) of a decoder's plane, which lives as long as the view."""
     samples = np.frombuffer(plane, dtype)
-    pitch = plane.line_size // samples.itemsize
-    pixels = samples[: pitch * height].reshape(height, pitch)[:, :width]
+    pitch = abs(plane.line_size) // samples.itemsize
+    pixels = samples[: pitch * height].reshape(height, pitch)[:: 1 if plane.line_size > 0 else -1, :width]
     pixels.flags.writeable = False
     return pixels
 
 
 def _check_whole(path: Path, container: Any, stream: Any, progress: _Progress) -> None:
     """Raise where the clip ended before it should, or frames of it were left out."""
-    if progress.cut or _ends_early(path, container, stream, progress):
+    if progress.cut or is_cut(path, container.format.name) or _ends_early(container, stream, progress):
         reason = f"{path}: the clip breaks off at {progress.last_time_s:.3f} s"
         raise InputError(reason, "the frames before were read; copy the file from the camera again")
     if progress.n_damaged:
-        after = f"the first after {progress.broken_at_s:.3f} s"
-        raise InputError(f"{path}: {progress.n_damaged} frames are damaged, {after}", "copy the file again")
+        after = "" if progress.broken_at_s is None else f", the first after {progress.broken_at_s:.3f} s"
+        reason = f" ({progress.reason})" if progress.reason else ""
+        raise InputError(f"{path}: {progress.n_damaged} frames are damaged{after}{reason}", "copy the file again")
 
 
-def _ends_early(path: Path, container: Any, stream: Any, progress: _Progress) -> bool:
-    """Whether the container's own index, frame count or duration asks for more than there was."""
-    if container.format.name == "avi":
-        return bool(stream.frames > progress.n_packets)
-    if container.format.name == "mpegts":
-        return _ends_within_packet(path)
-    entries = stream.index_entries
-    if "mp4" in container.format.name:
-        return _boxes_end(path) > container.size or any(entry.pos + entry.size > container.size for entry in entries)
-    frame_s = 1 / float(stream.average_rate or 30)
-    return progress.last_time_s + _END_TOLERANCE * frame_s < _stated_end_s(container, stream) < _MAX_S
-
-
-def _ends_within_packet(path: Path) -> bool:
-    """Whether a transport stream ends within one of its packets (ISO/IEC 13818-1, 2.4.3.2), which begin with 0x47.
-
-    On discs a time of four bytes stands before each, in broadcasts sixteen of correction after it.
-    """
-    with path.open("rb") as file:
-        head, length = file.read(1024), file.seek(0, os.SEEK_END)
-    for size, offset in ((188, 0), (192, 4), (204, 0)):
-        if len(head) > offset + size and head[offset] == head[offset + size] == _TS_SYNC:
-            return length % size != 0
-    return False
-
-
-def _boxes_end(path: Path) -> int:
-    """Where the last top-level box of an MP4 or MOV file ends by its own size (ISO/IEC 14496-12, section 4.2)."""
-    end = 0
-    with path.open("rb") as file:
-        while len(head := file.read(16)) >= 8:
-            size = int.from_bytes(head[:4])
-            size = int.from_bytes(head[8:]) if size == 1 else size
-            if size < 8 or not head[4:8].isalnum():  # 0: to the end of the file; no name: some camera's trailer
-                break
-            end += size
-            file.seek(end)
-    return end
-
-
-def _stated_end_s(container: Any, stream: Any) -> float:
-    """End of the last frame as the container states it; 0 if it states none, or possibly only that of the sound."""
-    if stream.duration is not None:
-        return float(stream.duration * stream.time_base)
-    sole = container.duration is not None and len(container.streams) == 1
-    return container.duration / 1e6 if sole else 0.0
+def _ends_early(container: Any, stream: Any, progress: _Progress) -> bool:
+    """Whether samples of the index, or the stated duration where no sizes are stated, ask for more than there was."""
+    name = container.format.name
+    if "mp4" in name:
+        return any(entry.pos + entry.size > container.size for entry in stream.index_entries)
+    if stream.duration is None or any(known in name for known in ("avi", "mpegts", "matroska")):
+        return False
+    frame_s, stated_end_s = _frame_s(stream), float(stream.duration * stream.time_base)
+    return progress.end_s + _END_TOLERANCE * frame_s < stated_end_s < _MAX_S
 
 
 def _open_failure(path: Path, error: Exception) -> tuple[str, str]:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from itertools import cycle
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -227,6 +229,24 @@ def test_slow_motion_counts_on_the_links_time(shaky: Clip, stretch: int) -> None
     results, score = received(shaky, frames)
     assert all(f"slow motion: time stamps are {stretch} times" in (result.message or "") for result in results)
     assert score.error_free >= 0.9 * score.expected
+    assert surely_wrong(results) == 0
+
+
+def test_the_speed_of_a_clip_is_judged_once(shaky: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Estimates that contradict each other had all frames entered anew without end."""
+    factors = cycle((2.0, 1.0))
+    monkeypatch.setattr(LinkTime, "time_stamp_stretch", lambda *_: next(factors))
+    assert all("slow motion" in (result.message or "") for result in received(shaky)[0])
+
+
+@pytest.mark.parametrize("sizes", [[(2, 2), (960, 540)], [(960, 540), (320, 180), (2, 2)], [(960, 540), (960, 536)]])
+def test_first_frames_of_changing_size(shaky: Clip, sizes: list[tuple[int, int]]) -> None:
+    """The last frames are of the first one's size, and the screen is found again."""
+    order = [*range(len(sizes)), *range(len(sizes)), *[sizes.index((960, 540))] * 20]
+    frames = tuple(replace(f, pixels=cv2.resize(f.pixels, sizes[k])) for f, k in zip(shaky[0], order, strict=False))
+    results, _ = received(shaky, frames)
+    assert [result.frame for result in results] == list(range(N_FRAMES))
+    assert {result.status for result in results[-3:]} <= {"ok", "partial"}
     assert surely_wrong(results) == 0
 
 

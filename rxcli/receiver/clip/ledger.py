@@ -103,7 +103,7 @@ class Ledger:
         waiting.view, self._scene = view, scene
         self._waiting.append(waiting)
         with view.context.timer("detect"):
-            if self._n_held and link.time.judged and not link.stamps_judged:
+            if self._n_held and self._stretch == 1 and link.time.judged and not link.stamps_judged:
                 stretch = link.estimate_stretch(self._views[0])
                 if stretch != link.time.stretch:
                     return done + self._enter_stretched(stretch)

@@ -117,6 +117,10 @@ def finish(state: State) -> list[FrameResult]:
 def _acquire(state: Acquiring, frame: Frame) -> tuple[State, list[FrameResult]]:
     """Take one of the first frames; they are received once they agree."""
     known, before = state.known, state.frames
+    if before and before.frames[0].pixels.shape != frame.pixels.shape:
+        after, results = _receive_first(known, before)
+        anew, more = _acquire(Acquiring(replace(after.known, camera=after.known.camera.of_frame(frame))), frame)
+        return anew, results + more
     frames = before.with_frame(frame, known.camera) if before else FirstFrames.begin(frame, known.camera)
     if isinstance(frames, Failure):
         after, results = _receive(Lost(known), frame, frames)
@@ -200,6 +204,8 @@ def _is_doubled(frame: Frame, before: Frame, corners: FloatArray | None) -> bool
     steps = np.maximum((ends - starts) // SETTINGS.same_points, 1)
     columns, rows = map(slice, starts.tolist(), ends.tolist(), steps.tolist())
     pixels, earlier = (each.pixels[rows, columns].astype(np.float32) for each in (frame, before))
+    if min(pixels.shape) < 2:  # The screen was in a larger frame.
+        return False
     contrast = float(np.abs(np.diff(pixels, axis=0)).mean())
     if contrast < SETTINGS.min_contrast * (frame.white - frame.black):
         return False
