@@ -58,7 +58,7 @@ class WholeFrames:
 
         Args:
             packet: the next one; None after the last.
-            has_gap: whether the container lost some of it.
+            has_gap: whether some of it was lost in the container.
         """
         import av
 
@@ -71,7 +71,7 @@ class WholeFrames:
             self._n_sent += 1
         try:
             for frame in self._codec.decode(packet):
-                self._take(frame)
+                self._enter(frame)
         except av.error.FFmpegError:  # of a packet that gives no frame; HEVC's do
             if self._codec.name == "hevc":
                 for picture in self._sent:
@@ -81,7 +81,7 @@ class WholeFrames:
             picture, frame = self._shown.popleft()
             yield None if picture.is_whole is False else frame
 
-    def _take(self, frame: Any) -> None:
+    def _enter(self, frame: Any) -> None:
         picture = frame.opaque
         picture.is_key, picture.place = frame.key_frame, self._n_shown
         picture.is_damaged |= frame.is_corrupt

@@ -1,4 +1,4 @@
-"""Where a file of a clip ends by what its container says of itself."""
+"""Where a file of a clip ends by the sizes that its container states."""
 
 from __future__ import annotations
 

@@ -156,7 +156,7 @@ def _packets(container: Any, stream: Any, progress: _Progress) -> Iterator[tuple
     for packet in _content(container, stream, progress):
         if before is not None:
             yield before, has_gap and not _is_joint(before, packet)
-        # FFmpeg's parser ends a packet where it finds the next one: what it says of that, it says of the one before.
+        # A parser ends a packet where it finds the next one, and flags the packet before the one that has the gap.
         has_gap = before is not None and before.is_corrupt if is_parsed else packet.is_corrupt
         before = packet
     progress.cut |= has_gap
@@ -261,7 +261,7 @@ def _frame(path: Path, frame: Any, stream: Any, progress: _Progress) -> Frame:
 def _fields(frame: Frame, decoded: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
     """The fields of a frame that is two, taken one after the other; else the frame.
 
-    Some cameras mark frames so whose rows are one picture: there, neighbouring rows are more alike than every other.
+    Some cameras mark frames so whose rows are one picture: there, neighbouring rows differ less than every other.
     """
     if not decoded.interlaced_frame:
         yield frame
