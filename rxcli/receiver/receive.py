@@ -18,12 +18,14 @@ from rxcli.profiles import ScreenProfile
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.in_common import named
 from rxcli.receiver.frame.passes import Reception, headerless, soft_bits
 from rxcli.receiver.frame.result import Failure, Received, failed
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import search
 from rxcli.receiver.search.attempts import receive_either_way
 from rxcli.receiver.search.outlines import no_screen, proposed_screens, too_small
+from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import FloatArray, Frame, FrameResult, OnTaps
@@ -59,7 +61,8 @@ def receive(frames: Iterable[Frame], options: ReceiverOptions, on_taps: OnTaps |
             return
         from rxcli.receiver.clip import receive_clip
 
-        for result in receive_clip(chain((frame_0, frame_1), source), options, on_taps):
+        for received in receive_clip(chain((frame_0, frame_1), source), options, on_taps):
+            result = named(received, options)
             yield result.with_columns_mirrored() if options.mirrored else result
 
 
@@ -84,6 +87,7 @@ def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None
         on_taps(frame.source, frame.index, received.taps)
     result = received.result
     result = replace(result, message=_with_tried(result, options.screens), timing_ms=cache.timer.total())
+    result = named(result, options)
     if options.mirrored:
         return result.with_columns_mirrored()
     return replace(result, mirrored=None if frame.metadata.names_front_camera else False)
@@ -103,7 +107,8 @@ def _receive_still(cache: FrameCache, options: ReceiverOptions) -> Received:
     if isinstance(screens, Failure):
         return Received(failed(nothing, screens), {})
     received = [_receive_screen(nothing, cache, outlines, options) for outlines in screens]
-    if not screens[0][0].stands_out and not received[0].result.packets:
+    clearest = received[0].result
+    if not screens[0][0].stands_out and not clearest.packets and clearest.message != STEADY_LIGHT:
         return Received(failed(nothing, no_screen(cache, options)), {})
     best, *less = sorted(received, key=lambda screen: -screen.n_believable)
     other_screens = tuple(screen.result for screen in less if screen.result.packets)

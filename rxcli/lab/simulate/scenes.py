@@ -67,7 +67,7 @@ class Scene:
     payload: bytes | None = None
     #: Gives labels to send instead, as the link layer has them.
     labels: LabelSource | None = None
-    #: Light 0..1 by slot, the same in all columns, instead of packets.
+    #: Light 0..1 by slot, (n,) of all columns or (columns, n), instead of packets.
     waveform: Waveform | None = None
     sensor: Sensor = field(default_factory=Sensor)
     lens: Lens = field(default_factory=Lens)

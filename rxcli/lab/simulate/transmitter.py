@@ -179,7 +179,7 @@ class Link:
     message: bytes | None = None
     #: What to send instead of it; None for `message`.
     labels: LabelSource | None = None
-    #: Common light 0..1 of all columns by slot number, instead of packets; None for packets.
+    #: Light 0..1 by slot number, (n,) of all columns or (columns, n), instead of packets; None for packets.
     waveform: Waveform | None = None
 
     @property
@@ -216,7 +216,8 @@ class Link:
     def slots(self, start: int, stop: int) -> NDArray[Any]:
         """(columns, stop - start) 0/1 slots from `start` on; dark before slot 0."""
         if self.waveform is not None:
-            return np.tile(self.waveform(np.arange(start, stop, dtype=np.float64)), (self.screen.columns, 1))
+            light = self.waveform(np.arange(start, stop, dtype=np.float64))
+            return np.broadcast_to(light, (self.screen.columns, stop - start))
         bursts = range(max(start, 0) // self.burst_slots, max(stop - 1, 0) // self.burst_slots + 1)
         sent = np.concatenate([np.tile(self.packets(b), self.screen.repeats) for b in bursts], axis=1)
         origin = bursts[0] * self.burst_slots

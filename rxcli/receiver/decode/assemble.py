@@ -29,7 +29,7 @@ _HEADERLESS = (
     "no packet header shows where this screen's packets have one; the screen may be another one (--screen auto tries "
     "all), its place wrong (--corners), or the column overexposed"
 )
-_ECHO = "it shows nothing but the light of the column beside it; show a brighter picture there"
+ECHO = "it shows nothing but the light of the column beside it; show a brighter picture there"
 _GOES_ON = "its burst goes on in the next frame and is reported there"
 
 
@@ -202,7 +202,7 @@ def _columns(
         elif status == "ok" or not bursts:
             message = _GOES_ON
         else:
-            message = _ECHO if any(burst.echo[column] for burst in bursts) else None
+            message = ECHO if any(burst.echo[column] for burst in bursts) else None
             message = _HEADERLESS if headerless[column] else message or _withheld(confidence, min_confidence)
             if any(burst.whole[column] for burst in bursts):
                 message = message or _light_reason(status, db)
@@ -300,7 +300,8 @@ def complete(n_observed: IntArray, max_missing: int = 0) -> BoolArray:
 def echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolArray:
     """(B, C) whether a column repeats the words of a brighter neighbour that no other column sends.
 
-    A column under a black picture shows its neighbour's light. If all columns send the same, more than two agree.
+    A column under a black picture shows its neighbour's light. If all columns send the same, more agree than a
+    column and both its neighbours.
     """
     words = np.concatenate(
         [np.broadcast_to(posteriors.w[:, None], (*posteriors.index.shape[:2], 1)), posteriors.index], 2
@@ -309,11 +310,11 @@ def echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolA
     beside = np.zeros(words.shape[:2], bool)
     if not like_next.any():
         return beside
-    two = (words[:, :, None] == words[:, None]).all(axis=-1).sum(axis=-1) == 2
+    few = (words[:, :, None] == words[:, None]).all(axis=-1).sum(axis=-1) <= 3
     db = np.array([-np.inf if value is None else value for value in snr_db])
     beside[:, 1:] |= like_next & (db[1:] < db[:-1])
     beside[:, :-1] |= like_next & (db[:-1] < db[1:])
-    return np.asarray(two & beside)
+    return np.asarray(few & beside)
 
 
 def find_headerless(header_llr: FloatArray) -> BoolArray:

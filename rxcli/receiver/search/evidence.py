@@ -46,10 +46,10 @@ def middle_score(scored: Scored) -> float:
 
 
 def distinct_share(reception: Reception) -> float:
-    """Share of the columns' slots that is independent of the neighbour's: too narrow columns repeat one packet."""
+    """Share of the evidence that columns add to that of their left neighbours: too narrow ones repeat one packet."""
     slots = reception.payload_lit
-    if len(slots) < 2:
-        return 1.0
     slots = slots - slots.mean(axis=1, keepdims=True)
     slots /= np.linalg.norm(slots, axis=1, keepdims=True) + TINY
-    return 1 - max(float((slots[1:] * slots[:-1]).sum(axis=1).mean()), 0.0)
+    own = np.logaddexp(reception.column_llr, 0.0)
+    repeated = float(own[1:] @ (slots[1:] * slots[:-1]).sum(axis=1))
+    return 1 - max(repeated / (float(own.sum()) + TINY), 0.0)

@@ -14,7 +14,7 @@ from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.plane import turned
 from rxcli.receiver.plane.orientation import PORTRAIT
 from rxcli.receiver.screen import find, geometry
-from rxcli.receiver.screen.bright import bright_quadrilateral
+from rxcli.receiver.screen.bright import bright_quadrilateral, striped_box
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search.cameras import known_lens
 from rxcli.receiver.search.settings import SETTINGS
@@ -23,8 +23,8 @@ from rxcli.types import FloatArray, Frame
 _TOO_SLOW = (
     "the screen may have no profile here (vlc-rx profiles lists them); else use a faster slot rate or shorter packets"
 )
-#: Log-odds of the bright part of a picture against columns that were found; probability that it is the whole screen, if
-#: it shows packets; and the share of its width within which corners are the same.
+#: Log-odds of the bright part of a picture against columns that were found; probability that it, or the part with
+#: stripes, is the whole screen, if it shows packets; and the share of its width within which corners are the same.
 _BRIGHT_LOG_ODDS, _BRIGHT_CERTAINTY, _SAME_OUTLINE = -50.0, 0.9, 0.025
 ON_ITS_SIDE = (
     "the screen's columns lie along the rows of the picture, as in portrait or where a picture was turned after it was "
@@ -47,16 +47,40 @@ def proposed_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
         with cache.timer("geometry"):
             return outside_the_picture(options.corners, frame) or [[_given(options.corners, cache, options)]]
     found = possible_screens(cache, options)
-    if found:
-        return found
+    without = [] if found else without_borders(cache)
+    if found or without:
+        return found or [without]
     if "no_screen" in options.skip or not may_fill(frame):
         return no_screen(cache, options)
     return [[Outline(whole_picture(frame), inferred=geometry.SIDE_NAMES, column_offset=None)]]
 
 
+def without_borders(cache: FrameCache) -> list[Outline]:
+    """Outlines of a screen without borders of columns, as all send the same, or one alone; none without stripes."""
+    frame = cache.frame
+    if not may_fill(frame):
+        return []
+    with cache.timer("geometry"):
+        bright, striped = bright_quadrilateral(cache.plane), striped_box(cache.plane)
+    if striped is None:
+        return []
+    own = Outline(
+        striped, _BRIGHT_CERTAINTY, column_offset=None, log_odds=_BRIGHT_LOG_ODDS, family=-2, stands_out=False
+    )
+    outlines = [own] if bright is None else [replace(own, corners=bright, log_odds=0.0, family=-1), own]
+    return [_viewed(outline, frame) for outline in outlines]
+
+
+def _viewed(outline: Outline, frame: Frame) -> Outline:
+    """An outline with its corners in the viewer's order."""
+    return replace(outline, corners=geometry.viewer_order(outline.corners, frame.metadata.orientation))
+
+
 def no_screen(cache: FrameCache, options: ReceiverOptions) -> Failure:
     """Failure of a picture without a screen."""
     reason = ON_ITS_SIDE if lies_on_its_side(cache, options) else reason_for_none(cache.frame)
+    if bright_quadrilateral(cache.plane) is not None:
+        reason += "; if the bright part is the screen, it is lit without slots"
     return Failure("no_screen", f"no screen found: {reason}")
 
 
@@ -78,8 +102,8 @@ def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
 
     def viewed(outline: Outline) -> Outline:
         """The outline with its corners in the viewer's order; the only wide layout may be that of any screen."""
-        corners = geometry.viewer_order(outline.corners, frame.metadata.orientation)
-        return replace(outline, corners=corners, n_columns=None if wide == [outline.n_columns] else outline.n_columns)
+        outline = _viewed(outline, frame)
+        return replace(outline, n_columns=None if wide == [outline.n_columns] else outline.n_columns)
 
     outlines = [[viewed(outline) for outline in screen] for screen in screens]
     if len(outlines) == 1 and bright is not None:

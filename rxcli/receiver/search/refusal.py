@@ -15,7 +15,7 @@ from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.steady import is_common_light, periodic_share
 from rxcli.receiver.frame.acquisition import noise_of
 from rxcli.receiver.frame.context import FrameContext
-from rxcli.receiver.frame.passes import Reception, shows_steady_light
+from rxcli.receiver.frame.passes import Reception, dark_columns, shows_steady_light
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.frame.settings import SETTINGS as PASSES
 from rxcli.receiver.search.hypothesis import Hypothesis
@@ -45,6 +45,9 @@ def light_without_data(context: FrameContext, reception: Reception) -> Failure |
     with context.timer("detect"):
         headers, q = PREAMBLE_SLOTS / reception.clock.packet_slots, reception.samples.samples_per_slot
         if not is_common_light(*reception.contrast, headers, SETTINGS.max_column_shift_slots * q):
+            return None
+        lit = reception.column_llr[~dark_columns(reception.snr)]
+        if lit.size and float(np.median(lit)) > PASSES.min_packets_llr:
             return None
         joint = as_one_column(reception)
         no_header = bool(np.any(assemble.find_headerless(joint.posteriors.header_llr)))

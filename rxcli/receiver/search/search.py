@@ -21,9 +21,9 @@ from rxcli.receiver.search import evidence
 from rxcli.receiver.search.cameras import settle
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
 from rxcli.receiver.search.numbers import less_likely_outlines, numbered
-from rxcli.receiver.search.outlines import proposed_screens
+from rxcli.receiver.search.outlines import proposed_screens, without_borders
 from rxcli.receiver.search.propose import Proposer
-from rxcli.receiver.search.refusal import light_without_data, why_no_packets
+from rxcli.receiver.search.refusal import STEADY_LIGHT, light_without_data, why_no_packets
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import in_other_bursts, initial_pass
 from rxcli.types import FloatArray
@@ -55,8 +55,33 @@ def search(
         if isinstance(screens, Failure):
             return screens
         outlines = screens[0]
+    found = _search(cache, options, known, outlines, budget)
+    packets = _packet_evidence(found)
+    if options.corners is not None or outlines[0].family < 0 or (packets and outlines[0].stands_out):
+        return found
+    without = without_borders(cache)
+    if not without:
+        return found
+    borderless = _search(cache, options, known, without, budget)
+    is_steady = isinstance(borderless, Failure) and borderless.message == STEADY_LIGHT and not packets
+    return borderless if is_steady or _packet_evidence(borderless) > SETTINGS.borderless_gain * packets else found
+
+
+def _packet_evidence(found: Found | Failure) -> float:
+    """Evidence of what was found, or 0 if it shows no packets."""
+    if isinstance(found, Failure) or found.best.evidence < SETTINGS.few_packets:
+        return 0.0
+    return found.best.evidence
+
+
+def _search(
+    cache: FrameCache, options: ReceiverOptions, known: FrameContext | None, outlines: list[Outline], budget: int
+) -> Found | Failure:
+    """`search` among outlines."""
     proposer = Proposer(cache, options, tuple(outlines), known)
-    walk = _Walk(proposer, budget if outlines[0].stands_out else SETTINGS.doubtful_budget)
+    if not outlines[0].stands_out:
+        budget = SETTINGS.borderless_budget if outlines[0].family < 0 else SETTINGS.doubtful_budget
+    walk = _Walk(proposer, budget)
     best = walk.run()
     min_evidence = SETTINGS.bail if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
     if best is None or best.evidence < min_evidence:

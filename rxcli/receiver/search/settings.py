@@ -22,10 +22,14 @@ class SearchSettings:
     #: Below this evidence an estimated camera is rejected; above the second no other one is proposed.
     few_packets: float = 40.0
     plain_estimate: float = 100.0
-    #: Maximum number of initial passes of a frame; if its columns do not stand out; and without any evidence.
+    #: Maximum number of initial passes of a frame; if its columns do not stand out, if it shows no borders of columns,
+    #: and without any evidence.
     budget: int = 24
     doubtful_budget: int = 3
+    borderless_budget: int = 12
     hopeless_budget: int = 8
+    #: Evidence of a screen without borders, times that of doubtful columns, from which it is taken instead.
+    borderless_gain: float = 2.0
     #: Siblings of a scored hypothesis get a pass if their score could come this near to the best one.
     reach: float = 3.0
     #: Number of columns up to which all are measured at once, not the middle half first.

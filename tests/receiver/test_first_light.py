@@ -1,0 +1,78 @@
+"""What a laboratory sends first: the same in all columns, a counter, one column alone, all lit, half lit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli.lab.simulate.capture import prepare
+from rxcli.lab.simulate.scenes import preset
+from rxcli.lab.simulate.truth import build_camera_profile
+from rxcli.options import receiver_options
+from rxcli.profiles import ScreenProfile, load_profile
+from rxcli.protocol import encode_packet
+from rxcli.receiver.receive import receive
+from rxcli.types import Frame, FrameResult
+
+SCREEN = load_profile("paper-17k3", ScreenProfile)
+N_BITS = 7 * SCREEN.payload_symbols
+
+
+def payload(number: int) -> NDArray[np.uint8]:
+    """A number of 16 bits over and over."""
+    return np.resize(np.unpackbits(np.frombuffer(number.to_bytes(2, "big"), np.uint8)), N_BITS)
+
+
+def slots_of(numbers: list[int]) -> NDArray[np.float64]:
+    """(20, slots) of bursts that send the same number in all columns."""
+    bursts = [np.tile(encode_packet(payload(number), 5), SCREEN.repeats) for number in numbers]
+    return np.tile(np.concatenate(bursts).astype(np.float64), (SCREEN.columns, 1))
+
+
+def received(slots: NDArray[np.float64], n_frames: int, *, known: bool, corners: bool = False) -> list[FrameResult]:
+    scene = preset("phone-plain" if n_frames == 1 else "video-1080p", SCREEN).scaled(0.6 if n_frames == 1 else 0.5, 1.0)
+
+    def light(slot: NDArray[np.float64]) -> NDArray[np.float64]:
+        return slots[:, np.maximum(slot, 0).astype(int) % slots.shape[1]]
+
+    take = prepare(replace(scene, waveform=light, picture="grey", n_frames=n_frames), 1)
+    captures = [take.frame(number) for number in range(n_frames)]
+    options = receiver_options()
+    if known:
+        options = replace(options, cameras=(build_camera_profile(scene, captures[0].exposure),), force_camera=True)
+    if corners:
+        options = replace(options, corners=captures[0].exposure.corners)
+    return list(receive([Frame(one.pixels, "drawn", one.frame, one.time_s) for one in captures], options))
+
+
+@pytest.mark.parametrize(("n_frames", "known"), [(1, False), (1, True), (3, True)])
+@pytest.mark.parametrize("numbers", [[0xCAFE], list(range(7, 27))], ids=["same", "counter"])
+def test_the_same_in_all_columns_is_received_and_named(numbers: list[int], n_frames: int, known: bool) -> None:
+    result = received(slots_of(numbers), n_frames, known=known)[-1]
+    sent = {np.packbits(payload(number)).tobytes().hex() for number in numbers}
+    right = {column.column for column in result.columns for packet in column.packets if packet.payload in sent}
+    assert len(right) >= 18
+    assert result.message == "all columns send the same"
+
+
+@pytest.mark.parametrize("n_frames", [1, 3])
+def test_one_column_alone_is_received_and_named(n_frames: int) -> None:
+    slots = slots_of([4711])
+    slots[np.arange(20) != 7] = 0
+    result = received(slots, n_frames, known=True)[-1]
+    assert [packet.payload for packet in result.packets] == [np.packbits(payload(4711)).tobytes().hex()]
+    assert "one column alone sends" in (result.message or "")
+    if n_frames == 1:
+        (result,) = received(slots, 1, known=True, corners=True)
+        assert result.message == "column 7 alone sends"
+
+
+@pytest.mark.parametrize(("n_lit", "says"), [(10, "lit without slots"), (5, "switched on and off steadily")])
+def test_a_screen_that_is_lit_or_half_lit_is_named(n_lit: int, says: str) -> None:
+    slots = np.tile((np.arange(2000) % 10 < n_lit).astype(np.float64), (20, 1))
+    (result,) = received(slots, 1, known=False)
+    assert not result.packets
+    assert says in (result.message or "")
