@@ -16,7 +16,7 @@ import select
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fcntl import ioctl
 from functools import partial
 from pathlib import Path
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from rxcli.errors import InputError
 from rxcli.ingest import v4l2_abi as abi
+from rxcli.ingest.times import FrameTimes
 from rxcli.types import Frame, Metadata
 
 Luma = NDArray[np.uint8] | NDArray[np.uint16]
@@ -108,7 +109,8 @@ class CameraCounts:
     dropped: int = 0
     damaged: int = 0
     connections: int = 0
-    #: Time of the first frame on the driver's clock, which goes on through connections.
+    #: On the driver's clock, which goes on through connections; and of the first frame there.
+    times: FrameTimes = field(default_factory=FrameTimes)
     start_s: float | None = None
 
 
@@ -182,7 +184,7 @@ class Camera:
         self._maps: list[mmap.mmap] = []
         #: Number of the last frame that the driver gave, and when it came.
         self._sequence: int | None = None
-        self._came_s = time.monotonic()
+        self._came_s = self._given_s = time.monotonic()
         with _explained(path):
             self._descriptor = _open(path)
             try:
@@ -293,10 +295,12 @@ class Camera:
             return None
         pixels, width, height = PIXEL_FORMATS[self.mode.pixel_format], self.mode.width, self.mode.height
         dtype = np.dtype(pixels.dtype)
-        pitch = self._form.bytesperline or width * pixels.step * dtype.itemsize
-        samples: NDArray[Any] = np.frombuffer(data, dtype, count=pitch * height // dtype.itemsize)
-        stop = pixels.start + width * pixels.step
-        return samples.reshape(height, -1)[:, pixels.start : stop : pixels.step].copy()
+        row = width * pixels.step * dtype.itemsize
+        pitch = max(self._form.bytesperline, row)
+        if min(buffer.bytesused, len(data)) < pitch * (height - 1) + row:
+            return None
+        samples: NDArray[Any] = np.ndarray((height, width * pixels.step), dtype, data, strides=(pitch, dtype.itemsize))
+        return samples[:, pixels.start :: pixels.step].copy()
 
     def _levels(self) -> tuple[float, float]:
         """Values of black and white."""
@@ -304,13 +308,18 @@ class Camera:
         full = form.quantization == abi.QUANTIZATION_FULL_RANGE or form.colorspace == abi.COLORSPACE_JPEG
         return (16, 235) if pixels.ycbcr and not full else (0, pixels.white)
 
-    def _frame(self, luma: Luma, time_s: float) -> Frame:
+    def _frame(self, luma: Luma, own_s: float) -> Frame:
+        """A frame; where the driver's times do not advance, by the time that passed here, in whole frames."""
+        step_s, fps = self._came_s - self._given_s, self.mode.fps
+        step_s = max(round(step_s * fps), 1) / fps if fps else step_s
+        time_s, nominal = self.counts.times.next(own_s, step_s)
+        self._given_s = self._came_s
         if self.counts.start_s is None:
             self.counts.start_s = time_s
         self.counts.delivered += 1
         metadata, (black, white) = Metadata(model=self._card, exposure_s=self.exposure_s), self._levels()
         index, time_s = self.counts.delivered - 1, time_s - self.counts.start_s
-        return Frame(luma, str(self._path), index, time_s, metadata, black=black, white=white)
+        return Frame(luma, str(self._path), index, time_s, metadata, black=black, white=white, nominal_time=nominal)
 
 
 def list_modes(path: Path) -> list[Mode]:
@@ -346,12 +355,15 @@ def _explained(path: Path) -> Iterator[None]:
 
 _PLUG = "plug it in again; --wait waits for it"
 _MISSING = "plug it in, or see `v4l2-ctl --list-devices`; --wait waits for it"
+_ROOM = "lower --width, --height or --fps, take --format MJPG, or give it a USB port apart from other cameras"
 _REFUSED = "no V4L2 camera, or one that refuses its own mode"
 _FAILURES = {
     errno.ENOENT: (CameraLost, "no such camera", _MISSING),
     errno.ENXIO: (CameraLost, "no such camera", _MISSING),
     errno.ENODEV: (CameraLost, "the camera was unplugged", _PLUG),
     errno.EBUSY: (CameraLost, "another program uses the camera", "close it (`fuser -v {path}` names it)"),
+    errno.ENOSPC: (CameraLost, "its USB port has no room left for this mode", _ROOM),
+    errno.ENOMEM: (CameraLost, "the driver has no memory for this mode", "lower --width and --height"),
     errno.EACCES: (InputError, "permission denied", "add yourself to the group `video` and log in again"),
     errno.ENOTTY: (InputError, _REFUSED, "name another /dev/video device"),
     errno.EINVAL: (InputError, _REFUSED, "name another /dev/video device"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import pty
@@ -123,9 +124,22 @@ class TestFaults:
         seen = bench.client({"stall_s": 0.3}, faults={"stall_after": 3})
         assert 1 <= len(seen["frames"]) <= 3
         assert "the camera sent nothing for 0.3 s" in seen["error"]
-        seen = bench.client({"pixel_format": "GREY"}, faults={"damage_every": 3})
-        assert len(seen["frames"]) == N_FRAMES
-        assert seen["damaged"] >= 4
+        for faults in ({"damage_every": 3}, {"short_every": 3}):
+            seen = bench.client({"pixel_format": "GREY"}, faults=faults)
+            assert len(seen["frames"]) == N_FRAMES
+            assert seen["damaged"] >= 4
+
+    @pytest.mark.parametrize("pace", [0, -1])
+    def test_times_that_do_not_advance_are_counted_in_frames(self, bench: Bench, pace: float) -> None:
+        seen = bench.client({"pixel_format": "GREY"}, pause_s=0.05, faults={"stamp_pace": pace})["frames"]
+        assert [frame["nominal_time"] for frame in seen] == [False, *[True] * (N_FRAMES - 1)]
+        steps = np.diff([frame["time_s"] for frame in seen]) * 60
+        np.testing.assert_allclose(steps, np.rint(steps), atol=0.01)
+        assert (steps > 1.5).all()  # some frames passed in each pause
+
+    def test_a_port_without_room(self, bench: Bench) -> None:
+        error = bench.client({}, 1, faults={"stream_error": errno.ENOSPC})["error"]
+        assert error.startswith("/dev/video0: its USB port has no room left for this mode; lower --width")
 
 
 @needs_umockdev

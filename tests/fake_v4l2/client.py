@@ -26,6 +26,7 @@ def main(settings: dict[str, Any], n_frames: int, pause_s: float) -> dict[str, A
                 {
                     "index": frame.index,
                     "time_s": frame.time_s,
+                    "nominal_time": frame.nominal_time,
                     "dtype": str(np.dtype(frame.pixels.dtype)),
                     "rows": frame.pixels[:, 0].tolist() if even else None,
                     "levels": [frame.black, frame.white],

@@ -56,6 +56,12 @@ class Faults:
     damage_every: int | None = None
     #: S_FMT answers with this format, whatever is asked for.
     force_format: str | None = None
+    #: Time stamps run so many times as fast as time: 0 makes them equal, -1 run backwards.
+    stamp_pace: float = 1.0
+    #: Every so many frames one has half of its bytes.
+    short_every: int | None = None
+    #: STREAMON fails with this error.
+    stream_error: int | None = None
 
 
 @dataclass
@@ -247,10 +253,14 @@ class FakeCamera:
         damaged = faults.damage_every is not None and self.n_frames % faults.damage_every == 0
         picture = self._picture(self.sequence)
         self.memory[index * BUFFER_BYTES : index * BUFFER_BYTES + len(picture)] = picture
-        time_s = self.started_s + self.sequence / self.fps
+        time_s = self.started_s + faults.stamp_pace * self.sequence / self.fps
+        if faults.short_every is not None and self.n_frames % faults.short_every == 0:
+            picture = picture[: len(picture) // 2]
         self._describe(a, index, len(picture), _BUFFER_ERROR if damaged else 0, time_s)
 
     def _stream_on(self, a: bytearray) -> None:
+        if self.faults.stream_error is not None:
+            raise DriverError(self.faults.stream_error)
         self.sequence, self.started_s = -1, time.monotonic()
 
     def _picture(self, sequence: int) -> bytes:

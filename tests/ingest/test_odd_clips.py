@@ -328,3 +328,4 @@ def test_times_after_a_joint_go_on() -> None:
     times, nominal = zip(*times_of([5.0, 5.1, 5.2, 0.0, 0.2, 0.3]), strict=True)
     np.testing.assert_allclose(times, [5.0, 5.1, 5.2, 5.3, 5.5, 5.6])
     assert not any(nominal)
+    assert sum(is_nominal for _, is_nominal in times_of([0.0] * 30)) == 29
