@@ -16,19 +16,18 @@ from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.decode import assemble
-from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.in_common import named
 from rxcli.receiver.frame.passes import Reception, headerless, soft_bits
 from rxcli.receiver.frame.result import Failure, Received, failed
 from rxcli.receiver.screen.outline import Outline
-from rxcli.receiver.search import search
+from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.attempts import receive_either_way
 from rxcli.receiver.search.outlines import no_screen, proposed_screens, too_small
 from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import FloatArray, Frame, FrameResult, OnTaps
+from rxcli.types import Frame, FrameResult, OnTaps
 
 _COUNTED_FROM_LEFT = (
     "no side of the screen is in view: columns are counted from the leftmost visible one; take one side into view to "
@@ -162,16 +161,19 @@ def _receive_screen(
         result = replace(result, message=too_small(context, acquisition.screen) or assemble.why_no_packet(columns))
     elif outline.is_counted_from_left:
         result = replace(result, message=_COUNTED_FROM_LEFT)
-    return Received(result, _taps(outline.corners, acquisition, reception))
+    return Received(result, _taps(found, reception))
 
 
-def _taps(corners: FloatArray, acquisition: Acquisition, reception: Reception) -> dict[str, Any]:
+def _taps(found: Found, reception: Reception) -> dict[str, Any]:
     """Arrays at the stage boundaries, by stage."""
+    initial = found.best.reception
     return {
-        "geometry.corners": corners,
-        "sampling": acquisition.profiles,
+        "geometry.corners": found.outline.corners,
+        "geometry.sampled_corners": found.best.context.sampled_corners,
+        "sampling": found.best.acquisition.profiles,
         "clock": reception.clock,
-        "samples": reception.samples,
+        "samples": initial.samples,
+        "channel.initial_metrics": initial.metrics,
         "channel.metrics": reception.metrics,
         "detect": reception.posteriors,
     }

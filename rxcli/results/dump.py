@@ -22,15 +22,18 @@ _Stage = TypeVar("_Stage", RowProfiles, Clock, SlotSamples, BurstPosteriors)
 class Taps:
     """The arrays of every stage boundary of one photograph: what each stage hands to the next."""
 
-    #: (4, 2) float64 stored pixels, top-left first, clockwise as a viewer sees the screen.
+    #: (4, 2) float64 stored pixels, top-left first, clockwise as a viewer sees the screen: where the screen is, by the
+    #: decided slots, and where the light was read.
     corners: FloatArray
+    sampled_corners: FloatArray
     #: Out of sampling: the light of every strip on every row.
     profiles: RowProfiles
-    #: Out of sync: the link's time, and the light resampled to it.
+    #: Out of sync: the link's time, and the light resampled to it in the initial pass.
     clock: Clock
     samples: SlotSamples
     #: (C, N + memory, 2**(memory+1)) float64, out of the channel: log-likelihood of the light of slot i, given pattern
-    #: j of the slot and those before it (`protocol.slot_patterns`).
+    #: j of the slot and those before it (`protocol.slot_patterns`); of `samples`, and of the last pass of each column.
+    initial_metrics: FloatArray
     metrics: FloatArray
     #: Out of detection.
     posteriors: BurstPosteriors
@@ -47,9 +50,11 @@ def read_taps(path: str | Path) -> Taps:
             arrays = dict(file)
         return Taps(
             arrays["geometry.corners"],
+            arrays["geometry.sampled_corners"],
             _stage(arrays, "sampling", RowProfiles),
             _stage(arrays, "clock", Clock),
             _stage(arrays, "samples", SlotSamples),
+            arrays["channel.initial_metrics"],
             arrays["channel.metrics"],
             _stage(arrays, "detect", BurstPosteriors),
         )

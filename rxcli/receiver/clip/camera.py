@@ -114,20 +114,20 @@ class ClipCamera:
         predicted = None if start is None else acquisition_at(start, context)
         if predicted is not None:
             return camera, Acquired(context, predicted, initial_pass(predicted))
-        at = replace(self.options, corners=corners)
-        found = located.found or search(cache, at, context)
+        # Of the camera's lens, and in no need of refinement.
+        outline = replace(located.outline, corners=corners, strips=None, grid=None)
+        found = located.found or search(cache, self.options, context, outlines=[outline])
         if isinstance(found, Failure):
             return camera, found
         if not self.is_compared:
-            camera, found = camera._compared(found, at)
+            camera, found = camera._compared(found, outline)
         best = found.best
         if best.context.camera.hypothesis is not None:
-            context = replace(
-                best.context, camera=replace(best.context.camera, hypothesis=None), sampled_corners=corners
-            )
+            context = replace(best.context, cache=cache, camera=replace(best.context.camera, hypothesis=None))
+        context = replace(context, sampled_corners=best.context.sampled_corners)
         return replace(camera, context=context), Acquired(context, best.acquisition, best.reception)
 
-    def _compared(self, found: Found, at: ReceiverOptions) -> tuple[ClipCamera, Found]:
+    def _compared(self, found: Found, outline: Outline) -> tuple[ClipCamera, Found]:
         """Estimate the camera of a clip's first frame where that of the profile explains little of it.
 
         Stabilisation crops and enlarges what was read, so that rows are no longer those of the profile.
@@ -137,11 +137,11 @@ class ClipCamera:
         if best.context.camera.profile is None or enough >= search_settings.plain:
             return compared, found
         context = best.context
-        estimated = search(context.cache, replace(at, cameras=(), force_camera=False))
+        options = replace(self.options, cameras=(), force_camera=False)
+        estimated = search(context.cache, options, outlines=[outline])
         if isinstance(estimated, Failure) or estimated.best.evidence < max(search_settings.few_packets, enough):
             return compared, found
         stretch = context.camera.line_delay_s / estimated.best.context.camera.line_delay_s
-        options = replace(self.options, cameras=(), force_camera=False)
         return replace(compared, options=options, message=_UNLIKE.format(stretch)), estimated
 
 

@@ -69,6 +69,7 @@ class Reporter:
 def _taps(result: FrameResult, view: View, ended: Sequence[BurstInClip]) -> dict[str, Any]:
     """What is written of a frame: as of a photograph, but strips as tracking samples them, and bursts that end here."""
     found: dict[str, Any] = {"geometry.corners": result.corners, "clock": view.bursts.clock}
+    found["geometry.sampled_corners"] = view.context.sampled_corners
     if view.light is not None and view.pose is not None:
         rows = view.pose.rows.astype(np.int64)
         found |= {"sampling.light": view.light, "sampling.inside": view.pose.map.inside, "sampling.rows": rows}

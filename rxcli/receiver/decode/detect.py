@@ -214,9 +214,9 @@ def _trellises(metrics: FloatArray, candidates: NDArray[np.bool_]) -> list[_Trel
         boundary += slots[..., slot, :].take(patterns[slot], axis=-1)
     boundary, top = _over_likeliest(boundary)
     words = slots[..., isi_memory:, :].reshape(*slots.shape[:-2], -1)
-    prior = top.sum(axis=(0, 1, -1))
+    log_scale = top.sum(axis=(0, 1, -1))
     return [
-        _trellis(w, chosen, metrics[:, chosen], words[:, :, chosen], boundary[:, :, chosen], prior[chosen])
+        _trellis(w, chosen, metrics[:, chosen], words[:, :, chosen], boundary[:, :, chosen], log_scale[chosen])
         for w in WEIGHTS
         if (chosen := np.flatnonzero(candidates[:, w - 1])).size
     ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Generator
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 
@@ -123,6 +124,7 @@ class _Walk:
         self._scored: list[Scored] = []
         self._tried: list[Tried] = []
         self._asked: set[tuple[object, ...]] = set()
+        self._number = count()
         self._fresh: list[_Entry] = []
         self._siblings: list[_Entry] = []
         #: None when there are no more; upper bound of the next one's log prior.
@@ -186,7 +188,7 @@ class _Walk:
         return len(passes) >= SETTINGS.hopeless_budget and max(passes) < SETTINGS.bail
 
     def _push(self, queue: list[_Entry], key: float, hypothesis: Hypothesis) -> None:
-        heapq.heappush(queue, (-key, hypothesis.identity, len(self._asked) + len(queue), hypothesis))
+        heapq.heappush(queue, (-key, hypothesis.identity, next(self._number), hypothesis))
 
     def _next(self) -> tuple[list[_Entry], _Entry] | None:
         """The next entry and its queue, or None if no entry could come near the best."""

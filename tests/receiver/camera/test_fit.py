@@ -129,10 +129,10 @@ def test_the_file_states_the_least_exposure() -> None:
 
 
 def test_errors_are_as_large_as_their_standard_deviations() -> None:
-    """Two of three errors should be within one deviation; of twelve, so many as hardly any other scale would give."""
-    within = 0
-    for seed in range(12):
+    """The sum of their squares lies within 99 % of a chi-square of 24; deviations twice or half as large do not."""
+    squares = 0.0
+    for seed in range(24):
         strips, lit = _strips(np.random.default_rng(seed), np.zeros(4))
         found, _ = _settled(strips, _hypothesis(np.zeros(4)), lit)
-        within += abs(found.rows_per_slot - ROWS_PER_SLOT) < found.rows_per_slot_sd
-    assert 4 <= within <= 11
+        squares += ((found.rows_per_slot - ROWS_PER_SLOT) / found.rows_per_slot_sd) ** 2
+    assert 9.9 < squares < 45.6
