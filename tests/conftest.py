@@ -32,6 +32,15 @@ def shared_captures() -> Path:
 
 
 @pytest.fixture(scope="session")
+def shared_cases() -> Path:
+    """The folder of odd files beside the checkout, which is no part of the project."""
+    folder = _SHARED / "cases"
+    if not folder.is_dir():
+        pytest.skip(f"no odd files at {folder}")
+    return folder
+
+
+@pytest.fixture(scope="session")
 def shared_real() -> Path:
     """The folder of real pictures beside the checkout, which is no part of the project."""
     folder = _SHARED / "real"

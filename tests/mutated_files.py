@@ -35,6 +35,7 @@ from typing import Any
 import numpy as np
 from ingest_files import BAYER, write_dng
 from numpy.typing import NDArray
+from odd_stills import odd_jpegs, odd_pngs, odd_tiffs
 from small_frames import write_frame, write_profiles
 
 from rxcli.resources import data_dir
@@ -194,6 +195,9 @@ def _write_stills(folder: Path, picture: NDArray[np.uint8]) -> None:
 
         pillow_heif.from_pillow(image).save(str(folder / "a.heic"))
     write_dng(folder / "a.dng", picture[..., 1].astype(np.uint16) * 16, BAYER)
+    for suffix, files in (("jpg", odd_jpegs(picture)), ("png", odd_pngs(picture)), ("tif", odd_tiffs(picture))):
+        for name, data in files.items():
+            (folder / f"{name}.{suffix}").write_bytes(data[0] if isinstance(data, tuple) else data)
 
 
 def _write_clips(folder: Path, picture: NDArray[np.uint8]) -> None:

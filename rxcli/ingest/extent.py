@@ -57,6 +57,14 @@ def bytes_claimed(file: BinaryIO) -> int:
     return 0
 
 
+def values_of(file: BinaryIO, tag: int) -> set[int]:
+    """Values of a tag in all directories of a TIFF-like file."""
+    head = file.read(16)
+    if head[:2] not in (b"II", b"MM"):
+        return set()
+    return {value for entries in _directories(file, head) for value in _values(file, entries, tag, _order(head))}
+
+
 def _end(file: BinaryIO, directory: Directory, order: str) -> int:
     """End of the last strip or tile of a directory, bytes."""
     values = {tag: _values(file, directory, tag, order) for pair in _PARTS for tag in pair}

@@ -21,6 +21,8 @@ from rxcli.ingest.orientation import as_stored, orientation_of
 from rxcli.ingest.sniff import check_size, damage_explained
 from rxcli.types import Metadata
 
+#: Samples a pixel of the planes by their chroma; full ones are held twice.
+_PLANES = {420: 1.5, 422: 6.0, 444: 6.0}
 #: `matrix_coefficients` of ITU-T H.273 that means BT.709.
 _MATRIX_BT709 = 1
 
@@ -37,14 +39,24 @@ def read_heif(data: bytes, path: Path) -> tuple[Luma, Metadata]:
         raise InputError(f"{path}: HEIC needs an extra", "run `pip install '.[web]'`, or save as JPEG") from None
     with damage_explained(f"{path}: the HEIC picture is damaged", "copy the file again"):
         file = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
-        width, height = file.size
-        check_size(path, width, height, 12, len(data))  # planes, interleaved RGB of up to 16 bits, luma
-        pixels = np.asarray(file)
         turned = _orientation(file[file.primary_index])
+        width, height = file.size
+        check_size(path, width, height, _bytes_a_pixel(file, turned != 1), len(data))
+        pixels = np.asarray(file)
     matrix = (file.info.get("nclx_profile") or {}).get("matrix_coefficients")
     luma = luma_of(pixels, BT709 if matrix == _MATRIX_BT709 else BT601)
     metadata = exif_metadata(file.info.get("exif") or b"")
-    return as_stored(luma, turned), replace(metadata, orientation=turned) if turned != 1 else metadata
+    if metadata.orientation not in (1, turned):
+        doubt = f"EXIF orientation {metadata.orientation} (HEIC has rotations of its own; columns may be reversed)"
+        metadata = replace(metadata, not_believed=(*metadata.not_believed, doubt))
+    return as_stored(luma, turned), replace(metadata, orientation=turned)
+
+
+def _bytes_a_pixel(file: Any, is_turned: bool) -> float:
+    """What libheif holds: planes, turned ones, and the interleaved samples; measured, luma fits in after the planes."""
+    channels, chroma = len(file.mode.partition(";")[0]), file.info.get("chroma")
+    planes: float = _PLANES.get(chroma, _PLANES[420]) + file.has_alpha + _PLANES[420] * is_turned
+    return (channels + planes) * (1 if file.info["bit_depth"] == 8 else 2)
 
 
 def _orientation(image: Any) -> int:

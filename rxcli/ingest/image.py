@@ -10,7 +10,9 @@ import logging
 import warnings
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -48,52 +50,68 @@ def read_image(path: Path, kind: Kind) -> Frame:
         from rxcli.ingest.heif import read_heif
 
         return _frame(path, *read_heif(data, path))
-    return _frame(path, _read_with_pillow(data, path), Metadata())
+    return _frame(path, *_read_with_pillow(data, path))
 
 
-def _frame(path: Path, luma: Luma, metadata: Metadata, linear: bool = False) -> Frame:
-    white = float(np.iinfo(luma.dtype).max)
-    return Frame(pixels=luma, source=str(path), metadata=metadata, white=white, linear=linear)
+def _frame(path: Path, luma: Luma, metadata: Metadata, linear: bool = False, white: int = 0) -> Frame:
+    white = white or np.iinfo(luma.dtype).max
+    return Frame(pixels=luma, source=str(path), metadata=metadata, white=float(white), linear=linear)
 
 
 def _read_png(data: bytes, path: Path) -> Frame:
     """By OpenCV, which keeps 16-bit colour; checked before, because libpng writes complaints to stderr."""
     import cv2
 
-    chunks = dict(_png_chunks(data, path))
-    header = chunks.get(b"IHDR", b"").ljust(13, b"\0")
+    chunks = list(_png_chunks(data, path))
+    by_name = {name: chunk for name, chunk in chunks if name != b"IDAT"}
+    header = bytes(by_name.get(b"IHDR", b""))[8:-4].ljust(13, b"\0")
     depth, samples = (2 if header[8] == 16 else 1), _PNG_SAMPLES.get(header[9], 4)
     held = depth * (samples + (samples > 1))  # and the luma that is made of colour
-    check_size(path, int.from_bytes(header[:4]), int.from_bytes(header[4:8]), held, len(data))
+    check_size(path, int.from_bytes(header[:4]), int.from_bytes(header[4:8]), held, 2 * len(data))
+    plain = b"".join([data[:8], *(chunk for name, chunk in chunks if not name[0] & _ANCILLARY)])
     try:
         with quiet_libraries():
-            bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+            bgr = cv2.imdecode(np.frombuffer(plain, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
         bgr = None
     if bgr is None:
         raise InputError(f"{path}: the PNG is damaged", "copy the file again")
     rgb = bgr if bgr.ndim == 2 else bgr[:, :, 2::-1]
-    return _frame(path, luma_of(rgb), exif_metadata(chunks.get(b"eXIf", b"")))
+    return _frame(path, luma_of(rgb), exif_metadata(bytes(by_name.get(b"eXIf", b""))[8:-4]))
 
 
 #: ISO 15948, table 11.1: samples of a pixel as OpenCV decodes it, by colour type; some may get an alpha.
 _PNG_SAMPLES = {0: 1, 2: 4, 3: 4, 4: 4, 6: 4}
+#: Bit of the first letter of chunks that decide no pixel (ISO 15948, section 5.4): texts, profiles, EXIF.
+_ANCILLARY = 0x20
 
 
-def _png_chunks(data: bytes, path: Path) -> Iterator[tuple[bytes, bytes]]:
-    """Name and content of the chunks of a PNG (ISO 15948, section 5.3), checked; image data without its content."""
-    at = 8
+def _png_chunks(data: bytes, path: Path) -> Iterator[tuple[bytes, memoryview]]:
+    """Yield name and bytes of the chunks of a PNG (ISO 15948, section 5.3); check those which decide pixels."""
+    view, at = memoryview(data), 8
     while True:
         length, name = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8]
-        end = at + 8 + length
-        if end + 4 > len(data):
+        end = at + 12 + length
+        if end > len(data):
             raise InputError(f"{path}: the PNG is cut after {len(data)} bytes", "copy the file again")
-        if zlib.crc32(memoryview(data)[at + 4 : end]) != int.from_bytes(data[end : end + 4]):
+        if not name[0] & _ANCILLARY and zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
             raise InputError(f"{path}: the PNG is damaged at byte {at}", "copy the file again")
-        yield name, b"" if name == b"IDAT" else data[at + 8 : end]
+        yield name, view[at:end]
         if name == b"IEND":
             return
-        at = end + 4
+        at = end
+
+
+#: TIFF 6.0 and its supplements: compressions whose libraries write no more than they are given room for, and JPEG.
+_COMPRESSIONS, _JPEG = (1, 5, 8, 32773, 32946, 34925, 50000, 7), 7
+#: Kinds of samples: white is zero, black is zero, RGB, indices of a palette; of JPEG pictures YCbCr, which become RGB.
+_MIN_IS_WHITE, _PALETTE, _PHOTOMETRICS, _YCBCR = 0, 3, (0, 1, 2, 3), 6
+#: Samples of fewer bits fill their two bytes, or one, from below.
+_PACKED_BITS = 16
+#: Thumbnails and masks, as flags of NewSubfileType.
+_REDUCED_OR_MASK = 1 | 4
+#: Pages of a file that are looked at, and bytes that are read of one at a time.
+_MAX_PAGES, _READ_BYTES = 32, 1 << 20
 
 
 def _read_tiff(path: Path) -> Frame:
@@ -104,44 +122,61 @@ def _read_tiff(path: Path) -> Frame:
         if claims_too_much(file):
             raise InputError(f"{path}: the TIFF's directories claim more than the file holds", "copy it again")
         metadata = tiff_metadata(file)
-    step = "save it uncompressed, or copy it again"
-    with damage_explained(f"{path}: the TIFF cannot be read", step), tifffile.TiffFile(path) as tiff:
-        page = tiff.pages[0]
+    with damage_explained(f"{path}: the TIFF is damaged or cut", "copy it again"), tifffile.TiffFile(path) as tiff:
+        page = _picture_page(tiff)
         _check_page(page, path)
-        pixels, min_is_white = _tiff_pixels(page, path), page.photometric == tifffile.PHOTOMETRIC.MINISWHITE
-    if pixels.ndim not in (2, 3):
-        raise InputError(f"{path}: the TIFF is damaged", "copy it again")
-    luma, linear = _tiff_luma(pixels, path)
-    return _frame(path, np.iinfo(luma.dtype).max - luma if min_is_white else luma, metadata, linear)
+        step = "copy it again" if page.compression == 1 else "copy it again, or save it uncompressed"
+        with damage_explained(f"{path}: the TIFF cannot be read", step):
+            pixels = page.asarray(maxworkers=1, buffersize=_READ_BYTES)
+        if page.axes == "SYX":
+            pixels = np.moveaxis(pixels, 0, -1)
+        if page.photometric == _PALETTE:
+            pixels = (luma_of(page.colormap.T[None])[0] >> 8).astype(np.uint8)[pixels]
+        luma, linear = _tiff_luma(pixels, path)
+        is_packed = page.dtype.kind == "u" and page.photometric != _PALETTE and 1 < page.bitspersample < _PACKED_BITS
+    white = (1 << page.bitspersample) - 1 if is_packed else np.iinfo(luma.dtype).max
+    return _frame(path, white - luma if page.photometric == _MIN_IS_WHITE else luma, metadata, linear, white)
+
+
+def _picture_page(tiff: Any) -> Any:
+    """The largest page of a TIFF that is no thumbnail and no mask; some programs write thumbnails first."""
+    pages = []
+    for page in islice(tiff.pages, _MAX_PAGES):
+        pages.append(page)
+        with suppress(Exception):  # nested ones may be broken, or none
+            pages += islice(page.pages, _MAX_PAGES)
+    whole = [page for page in pages if not page.subfiletype & _REDUCED_OR_MASK]
+    return max(whole or pages, key=lambda page: page.imagewidth * page.imagelength)
 
 
 def _check_page(page: Any, path: Path) -> None:
-    """Refuse what would fill the memory: samples as they are, as float32 or 16 bits, and luma."""
-    size, samples = page.bitspersample // 8 or 1, max(page.samplesperpixel, 1)
-    held = size * samples + (4 * samples if size > 2 else 0) + (size if samples > 1 else 0)
-    check_size(path, page.imagewidth, page.imagelength, held, page.rowsperstrip * page.imagewidth * size * samples)
+    """Refuse what is no plain picture, and what would fill the memory: samples, floats, luma, and one part unfolded."""
+    photometric, compression = (getattr(tag, "name", tag) for tag in (page.photometric, page.compression))
+    is_jpeg, kinds, bits = page.compression == _JPEG, page.axes in ("YX", "YXS", "SYX"), page.bitspersample
+    if not (kinds and page.photometric in (*_PHOTOMETRICS, *[_YCBCR] * is_jpeg)) or page.dtype is None:
+        reason = f"{path}: the TIFF holds {photometric} samples of {bits} bits (axes {page.axes})"
+        raise InputError(reason, "save one plain picture, grey or RGB, with 8 or 16 bits a sample")
+    if page.compression not in _COMPRESSIONS or (is_jpeg and bits > 8):
+        reason = f"{path}: the TIFF's compression is {compression} of {bits} bits"
+        raise InputError(reason, "save it uncompressed, or with LZW or Deflate")
+    size, samples = page.dtype.itemsize, max(page.samplesperpixel, 1)
+    held = size * samples + (5 * samples + 6 if size > 2 or page.dtype.kind == "f" else size * (samples > 1))
+    rows, width = (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, page.imagewidth)
+    part = size * samples * width * (rows if page.is_tiled else min(rows, page.imagelength))
+    check_size(path, page.imagewidth, page.imagelength, held, part if page.compression != 1 else 0)
+    if is_jpeg and any(w > width or h > rows for w, h in _jpeg_sizes(page)):
+        raise InputError(f"{path}: the TIFF holds a JPEG larger than itself", "the file is damaged or a bomb")
+    if sum(page.databytecounts) > 2 * path.stat().st_size:
+        raise InputError(f"{path}: the TIFF's directories claim more than the file holds", "copy it again")
 
 
-def _tiff_pixels(page: Any, path: Path) -> NDArray[Any]:
-    """Pixels (height, width[, samples]) of a TIFF page, by Pillow where tifffile has no codec; neither turns them."""
-    if page.axes == "SYX":
-        return np.moveaxis(page.asarray(), 0, -1)
-    if page.axes not in ("YX", "YXS"):
-        raise InputError(f"{path}: the TIFF's axes are {page.axes}", "save one plain picture")
-    if page.compression in (5, 6, 7) or page.colormap is not None:  # LZW, JPEG: tifffile needs imagecodecs for them
-        return _pillow_tiff(path, page)
-    return np.asarray(page.asarray())
+def _jpeg_sizes(page: Any) -> Iterator[tuple[int, int]]:
+    """Width and height of the JPEG pictures that the parts of a page are."""
+    from rxcli.ingest.jpeg import frame_of
 
-
-def _pillow_tiff(path: Path, page: Any) -> NDArray[Any]:
-    from PIL import Image
-
-    from rxcli.ingest.orientation import as_stored
-
-    tag = page.tags.get("Orientation")
-    orientation = int(tag.value) if tag is not None and tag.value in range(1, 9) else 1
-    with _no_warnings(), quiet_libraries(), Image.open(path, formats=("TIFF",)) as image:
-        return as_stored(_pillow_pixels(image), orientation)  # Pillow turns TIFFs for viewing
+    for at, length in zip(page.dataoffsets, page.databytecounts, strict=False):
+        page.parent.filehandle.seek(at)
+        yield frame_of(page.parent.filehandle.read(length))[:2]
 
 
 def _tiff_luma(pixels: NDArray[Any], path: Path) -> tuple[Luma, bool]:
@@ -175,7 +210,7 @@ def _light_of(pixels: NDArray[Any]) -> NDArray[np.float32]:
     return light
 
 
-def _read_with_pillow(data: bytes, path: Path) -> NDArray[np.uint8]:
+def _read_with_pillow(data: bytes, path: Path) -> tuple[NDArray[np.uint8], Metadata]:
     """BMP, WebP: rare for a camera, but messengers send them."""
     from PIL import Image
 
@@ -185,11 +220,5 @@ def _read_with_pillow(data: bytes, path: Path) -> NDArray[np.uint8]:
         Image.open(io.BytesIO(data), formats=("BMP", "WEBP")) as image,
     ):
         check_size(path, *image.size, 8, len(data))  # as it is stored, as RGB twice, luma
-        return np.asarray(luma_of(_pillow_pixels(image)), np.uint8)
-
-
-def _pillow_pixels(image: Any) -> NDArray[Any]:
-    """Grey or RGB pixels of a Pillow image; 16 bits stay 16."""
-    plain = image.mode in ("L", "RGB", "I;16", "I;16B", "F")
-    pixels = np.asarray(image if plain else image.convert("RGB"))
-    return pixels.astype(pixels.dtype.newbyteorder("="))
+        pixels = np.asarray(image if image.mode in ("L", "RGB") else image.convert("RGB"))
+        return np.asarray(luma_of(pixels), np.uint8), exif_metadata(image.info.get("exif") or b"")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import struct
+import tempfile
 from collections.abc import Iterator
 from typing import Any
 
@@ -10,17 +12,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError, reason_of
-from rxcli.ingest.sniff import check_size
+from rxcli.ingest.quiet import quiet_libraries
+from rxcli.ingest.sniff import check_size, damage_explained
 
-#: What simplejpeg raises; KeyError for a subsampling that it does not know.
+#: What simplejpeg raises.
 _FAULTS = (ValueError, KeyError, MemoryError, OverflowError)
-#: Frames whose coefficients are gathered from several scans; baseline ones may be, too, in separate scans.
-_PROGRESSIVE = (0xC2, 0xC6, 0xCA, 0xCE)
-#: Start of a scan.
-_SCAN = 0xDA
+#: ITU-T T.81, table B.1: starts of frames (sequential ones, and progressive ones, whose coefficients come in several
+#: scans), of the picture and of a scan; its end; notes of programs, and Adobe's.
+_SEQUENTIAL, _PROGRESSIVE = (0xC0, 0xC1, 0xC9), (0xC2, 0xC6, 0xCA, 0xCE)
+_FRAMES = (*_SEQUENTIAL, *_PROGRESSIVE, 0xC3, 0xC5, 0xC7, 0xCB, 0xCD, 0xCF)
+_START, _END, _SCAN, _NOTES, _ADOBE = 0xD8, 0xD9, 0xDA, (*range(0xE0, 0xF0), 0xFE), 0xEE
+#: A marker with its padding; no stuffed byte, and no restart within a scan.
+_MARKER = re.compile(rb"\xff+[^\x00\x01\xff\xd0-\xd7]")
+#: Frames from here on are coded arithmetically, which shows no missing end.
+_ARITHMETIC = 0xC9
+#: Coefficients of a block.
+_BLOCK = 64
 #: Encoders use some ten; every scan goes over the whole picture.
 _MAX_SCANS = 100
-_PADDING = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
+_SURPLUS = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
+#: Bytes that the decoder may have read ahead when it counts the surplus.
+_READ_AHEAD = 16
 
 
 def decode_luma(data: Any, source: object, at_once: int = 1) -> NDArray[np.uint8]:
@@ -34,49 +46,53 @@ def decode_luma(data: Any, source: object, at_once: int = 1) -> NDArray[np.uint8
     Raises:
         InputError: truncated (with the number of rows), damaged, or no JPEG.
     """
-    import simplejpeg
-
-    try:
-        height, width, _, _ = simplejpeg.decode_jpeg_header(data, strict=False)
-    except _FAULTS:
-        raise InputError(f"{source}: the JPEG header is damaged or cut", "copy the file again") from None
-    held, is_one_scan = _frame_of(data)
+    data = bytes(data)
+    width, height, held, is_one_scan = frame_of(data)
+    if not width:
+        raise InputError(f"{source}: the JPEG header is damaged or cut", "copy the file again")
     check_size(source, width, height, at_once * held, at_once * len(data))
-    if not is_one_scan and bytes(data).count(b"\xff\xda") > _MAX_SCANS:
+    # What follows the picture, as in motion photos, may hold more.
+    may_have_many = not is_one_scan and data.count(bytes((0xFF, _SCAN))) > _MAX_SCANS
+    if may_have_many and sum(part[0] == _SCAN for part in segments(data, beyond_scan=True)) > _MAX_SCANS:
         raise InputError(f"{source}: the JPEG has more than {_MAX_SCANS} scans", "the file is damaged or a bomb")
     try:
         return _gray(data)
-    except _FAULTS as error:
-        return _decode_damaged(data, reason_of(error), source)
+    except _FAULTS:
+        return _decode_odd(*_picture_of(data), source)
 
 
-def _frame_of(data: Any) -> tuple[float, bool]:
-    """Bytes a pixel that decoding takes, and whether all of it is one scan.
+def frame_of(data: bytes) -> tuple[int, int, float, bool]:
+    """Width and height, bytes a pixel that decoding takes, and whether all of it is one scan; zeros without a scan.
 
-    Luma, and the coefficients of all components where they come in several scans. ITU-T T.81, B.2.2: the frame header's
-    marker identifies the process, its sixth byte is the number of components; B.2.3: the first byte of a scan's header
-    is the number of its components.
+    Luma, and the coefficients of all components where they come in several scans. ITU-T T.81, B.2.2: a frame's header
+    holds precision, height, width and number of components; B.2.3: a scan's begins with the number of its components.
     """
-    held, n_components, is_progressive = 1.0, 0, False
-    for marker, start, _ in segments(data):
+    width, height, held, n_components, is_progressive = 0, 0, 1.0, 0, False
+    for marker, start, end in segments(data):
+        content = data[start:end]
         if marker == _SCAN:
-            return held, not is_progressive and data[start] == n_components
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            n_components, is_progressive = data[start + 5], marker in _PROGRESSIVE
+            return width, height, held, not is_progressive and content[:1] == bytes([n_components])
+        if marker in _FRAMES and len(content) >= 6:
+            height, width, n_components = struct.unpack_from(">xHHB", content)
+            is_progressive = marker in _PROGRESSIVE
             held = 1.0 + (2 * n_components if is_progressive else 0)
-    return held, False
+    return 0, 0, held, False
 
 
-def segments(data: Any) -> Iterator[tuple[int, int, int]]:
-    """Marker, and start and end of the content, of the segments up to the first scan (ITU-T T.81, B.1.1.4)."""
-    at = 2
-    while at + 10 <= len(data) and data[at] == 0xFF:
-        if data[at + 1] == 0xFF:  # padding
-            at += 1
+def segments(data: bytes, beyond_scan: bool = False) -> Iterator[tuple[int, int, int]]:
+    """Marker, and start and end of the content, of the segments up to the first scan (ITU-T T.81, B.1.1.4).
+
+    Stray bytes are passed over. With `beyond_scan` the segments between scans and the end marker follow.
+    """
+    at, is_header = 2, True
+    while found := _MARKER.search(data, at):
+        marker, at = data[found.end() - 1], found.end()
+        if marker == _START and is_header:  # written twice
             continue
-        end = at + 2 + max(data[at + 2] << 8 | data[at + 3], 2)
-        yield data[at + 1], at + 4, end
-        if data[at + 1] == _SCAN:
+        end = at if marker in (_START, _END) else at + max(int.from_bytes(data[at : at + 2]), 2)
+        yield marker, at + 2, end
+        is_header = is_header and marker != _SCAN
+        if marker == _END or not (is_header or beyond_scan):
             return
         at = end
 
@@ -88,28 +104,78 @@ def _gray(data: Any, strict: bool = True) -> NDArray[np.uint8]:
     return luma
 
 
-def _decode_damaged(data: Any, reason: str, source: object) -> NDArray[np.uint8]:
-    """Accept harmless padding; report any other damage with the number of rows present."""
-    try:
-        luma = _gray(data, strict=False)
-    except _FAULTS:
-        raise InputError(f"{source}: cannot be decoded as JPEG ({reason})", "copy the file again") from None
-    if _is_padding(bytes(data), reason):
+def _decode_odd(picture: bytes, has_end: bool, is_complete: bool, source: object) -> NDArray[np.uint8]:
+    """Decode what is left of a file that is not as the standard asks; report damage, and the rows of a cut picture."""
+    with damage_explained(f"{source}: cannot be decoded as JPEG", "copy the file again"):
+        luma, fault = _with_fault(picture)
+    if (has_end or is_complete) and (not fault or _is_surplus(picture, fault, has_end)):
         return luma
-    if "end of JPEG" in reason:
-        missing = f"the JPEG is cut: {_rows_present(luma)} of {luma.shape[0]} rows are there"
+    rows, height = _rows_present(luma), len(luma)
+    missing = f"{rows} of {height} rows are there" if rows < height else "its last part is missing"
+    reason = f"is damaged ({fault})" if has_end else f"is cut: {missing}"
+    raise InputError(f"{source}: the JPEG {reason}", "copy the file again")
+
+
+def _with_fault(picture: bytes) -> tuple[NDArray[np.uint8], str]:
+    """Luma, and the first fault that the decoder met; by OpenCV where simplejpeg does not know the sampling."""
+    import cv2
+
+    try:
+        return _gray(picture), ""
+    except _FAULTS as error:
+        fault = reason_of(error)
+    if "subsampling" not in fault:
+        return _gray(picture, strict=False), fault
+    with tempfile.TemporaryFile() as messages:
+        with quiet_libraries(messages):
+            luma = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        messages.seek(0)
+        fault = messages.readline().decode("ascii", "replace").strip()
+    if luma is None:
+        raise ValueError(fault or "no picture in it")
+    return np.asarray(luma, np.uint8), fault
+
+
+def _picture_of(data: bytes) -> tuple[bytes, bool, bool]:
+    """The picture alone, whether its end marker was there, and whether its scans are complete.
+
+    Stray bytes, notes of programs and what follows the picture are left out. The last three bytes of a scan's header
+    mean nothing in a sequential picture, and are set as ITU-T T.81, table B.3, asks.
+    """
+    parts, scan_at, lacking, sort = [b"\xff\xd8"], 0, 1, 0
+    for marker, start, end in segments(data, beyond_scan=True):
+        if scan_at:
+            parts.append(data[scan_at : start - 4])
+        if marker == _END or (scan_at and lacking <= 0):
+            break
+        content = data[start:end]
+        if marker in _FRAMES:
+            sort, lacking = marker, _BLOCK * (content + bytes(6))[5]
+        elif marker == _SCAN and len(content) > 3:
+            content = content[:-3] + b"\0\x3f\0" if sort in _SEQUENTIAL else content
+            start_k, end_k, precision = content[-3:]
+            is_exact = precision & 15 == 0
+            lacking -= content[0] * ((end_k + 1 - start_k) * is_exact if sort in _PROGRESSIVE else _BLOCK)
+        if marker not in _NOTES or (marker == _ADOBE and content[11:12] in (b"\0", b"\1", b"\2")):
+            parts.append(struct.pack(">BBH", 0xFF, marker, len(content) + 2) + content)
+        scan_at = end if scan_at or marker == _SCAN else 0
     else:
-        missing = f"the JPEG is damaged ({reason})"
-    raise InputError(f"{source}: {missing}", "copy the file again")
+        marker = 0
+        parts.append(data[scan_at:] if scan_at else b"")
+    return b"".join([*parts, b"\xff\xd9"]), marker == _END, lacking <= 0 and sort < _ARITHMETIC
 
 
-def _is_padding(data: bytes, reason: str) -> bool:
-    """Whether the only fault is a run of one byte before the end marker, as some cameras write it."""
-    match = _PADDING.search(reason)
+def _is_surplus(picture: bytes, reason: str, has_end: bool) -> bool:
+    """Whether the only fault is what stands between the last scan and the end: padding, or a trailer without a marker.
+
+    A run of one byte, as some cameras write it, that begins within the scan is what a lost part was filled with.
+    """
+    match = _SURPLUS.search(reason)
     if match is None:
         return False
-    end = data.rfind(b"\xff\xd9")
-    return len(set(data[end - int(match[1]) : end])) == 1
+    start = len(picture) - 2 - int(match[1])
+    is_run = len(set(picture[start:-2])) == 1
+    return len(set(picture[start - _READ_AHEAD : -2])) > 1 if is_run else not has_end
 
 
 def _rows_present(luma: NDArray[np.uint8]) -> int:

@@ -15,13 +15,13 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rxcli.ingest.extent import claims_too_much
+from rxcli.ingest.extent import claims_too_much, values_of
 from rxcli.ingest.jpeg import segments
 from rxcli.ingest.sniff import RAW_SUFFIXES
 from rxcli.types import Metadata
 
 # TIFF 6.0, and DNG 1.4; a colour filter array, and linear RAW.
-_SUBFILE_TYPE, _PHOTOMETRIC, _DNG_VERSION = 0x00FE, 0x0106, 0xC612
+_PHOTOMETRIC, _DNG_VERSION = 0x0106, 0xC612
 _RAW_PHOTOMETRICS = (32803, 34892)
 # EXIF 2.32, tables 3 to 8.
 _MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
@@ -67,14 +67,14 @@ def tiff_metadata(stream: BinaryIO) -> Metadata:
 
 def is_raw_tiff(path: Path) -> bool:
     """Whether a TIFF file is a camera's RAW in TIFF clothes: a DNG, a mosaic, or a preview with its RAW further on."""
+    has_raw_name = path.suffix.lower() in RAW_SUFFIXES
     with path.open("rb") as file:
         tags, _ = _load_directories(file)
-    has_raw_name = path.suffix.lower() in RAW_SUFFIXES
-    if not tags:
-        return has_raw_name
-    if _DNG_VERSION in tags or tags.get(_PHOTOMETRIC) in _RAW_PHOTOMETRICS:
-        return True
-    return _MAKE in tags and (tags.get(_SUBFILE_TYPE) == 1 or has_raw_name)
+        if not tags:
+            return has_raw_name
+        file.seek(0)
+        has_raw_samples = not values_of(file, _PHOTOMETRIC).isdisjoint(_RAW_PHOTOMETRICS)
+    return _DNG_VERSION in tags or has_raw_samples or (_MAKE in tags and has_raw_name)
 
 
 def raw_metadata(path: Path) -> Metadata:

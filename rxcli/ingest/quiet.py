@@ -7,13 +7,18 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Lock
+from typing import IO
 
 _LOCK = Lock()
 
 
 @contextmanager
-def quiet_libraries() -> Iterator[None]:
-    """Discard all output to the file descriptor of stderr within the block; one thread at a time."""
+def quiet_libraries(sink: IO[bytes] | None = None) -> Iterator[None]:
+    """Discard all output to the file descriptor of stderr within the block; one thread at a time.
+
+    Args:
+        sink: an open file that takes it instead.
+    """
     with _LOCK:
         try:
             original = os.dup(2)
@@ -23,9 +28,8 @@ def quiet_libraries() -> Iterator[None]:
         try:
             if sys.stderr is not None:
                 sys.stderr.flush()
-            null = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(null, 2)
-            os.close(null)
+            with open(os.devnull, "wb") as null:
+                os.dup2((sink or null).fileno(), 2)
             yield
         finally:
             os.dup2(original, 2)

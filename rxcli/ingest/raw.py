@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError, reason_of
-from rxcli.ingest.extent import bytes_claimed, claims_too_much
+from rxcli.ingest.extent import bytes_claimed, claims_too_much, values_of
 from rxcli.ingest.metadata import believed, merge, raw_metadata
 from rxcli.ingest.quiet import quiet_libraries
 from rxcli.ingest.sniff import check_size
@@ -25,6 +25,8 @@ _FLIP_ORIENTATION = {0: 1, 3: 3, 5: 8, 6: 6}
 #: Colour filter arrays repeat with one of these periods: Bayer, X-Trans, and what LibRaw calls 16 x 16.
 _PERIODS = (2, 4, 6, 8, 16)
 
+#: DNG 1.7: the tag of the compression, and JPEG XL.
+_COMPRESSION, _JPEG_XL = 259, 52546
 #: LibRaw keeps values of two bytes, and where all colours stand at each pixel, four of them.
 _BYTES_A_PIXEL = 2
 
@@ -46,7 +48,7 @@ def read_raw(path: Path) -> Frame:
         with quiet_libraries():
             image = raw.raw_image
     except rawpy.LibRawFileUnsupportedError:
-        raise InputError(f"{path}: no RAW format that LibRaw knows", "convert it to DNG, or use the JPEG") from None
+        raise InputError(*_unsupported(path)) from None
     except (rawpy.LibRawError, RuntimeError, OSError, MemoryError, ValueError) as error:
         raise InputError(
             f"{path}: the RAW file is damaged or cut ({_libraw_reason(error)})", "copy the file again"
@@ -84,6 +86,15 @@ def _check_whole(path: Path) -> None:
     if size < claimed:
         reason = f"{path}: the RAW file is cut: {size} of at least {claimed} bytes are there"
         raise InputError(reason, "copy it from the camera again")
+
+
+def _unsupported(path: Path) -> tuple[str, str]:
+    """Reason and next step for a file that LibRaw does not know."""
+    with path.open("rb") as file:
+        if _JPEG_XL in values_of(file, _COMPRESSION):
+            step = "set the camera's RAW files to lossless JPEG, or use the JPEG"
+            return f"{path}: the RAW file is compressed as JPEG XL, which LibRaw does not read", step
+    return f"{path}: no RAW format that LibRaw knows", "use the JPEG, or convert it to a plain DNG"
 
 
 def _mosaic(raw: Any, top: int, left: int, path: Path) -> Mosaic:

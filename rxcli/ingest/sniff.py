@@ -14,7 +14,7 @@ from rxcli.errors import InputError, reason_of
 Kind = Literal["jpeg", "png", "tiff", "heif", "other_image", "raw", "video", "device"]
 
 IMAGE_SUFFIXES = frozenset(
-    {".jpg", ".jpeg", ".jpe", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".bmp", ".webp"}
+    {".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".bmp", ".webp"}
 )
 # fmt: off
 RAW_SUFFIXES = frozenset({
@@ -42,7 +42,7 @@ _LIST_MAGIC = (b"#EXTM3U", b"ffconcat", b"<MPD")
 _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"hevc", b"hevx", b"msf1")
 #: Signatures: offset, bytes and kind; the first match decides.
 _MAGIC: tuple[tuple[int, tuple[bytes, ...], Kind], ...] = (
-    (0, (b"\xff\xd8\xff",), "jpeg"),
+    (0, (b"\xff\xd8",), "jpeg"),
     (0, (b"\x89PNG\r\n\x1a\n",), "png"),
     (0, (b"FUJIFILMCCD-RAW", b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FOVb", b"\0MRM"), "raw"),
     (0, (b"II\x1a\0\0\0HEAPCCDR",), "raw"),

@@ -84,7 +84,8 @@ def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None
         received = receive_either_way(cache, _in_total_order(options), _receive_still)
     if on_taps is not None and received.taps:
         on_taps(frame.source, frame.index, received.taps)
-    result = received.result
+    claims = ", ".join(frame.metadata.not_believed) if received.result.packets else ""
+    result = received.with_remark(claims and f"not believed: {claims}").result
     result = replace(result, message=_with_tried(result, options.screens), timing_ms=cache.timer.total())
     result = named(result, options)
     if options.mirrored:

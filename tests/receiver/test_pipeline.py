@@ -335,6 +335,12 @@ def test_a_picture_that_was_turned_afterwards_is_received_turned_back(quarter_tu
         assert np.abs(turned_back.corners - corners_of(taken)).max() < 8
 
 
+def test_what_is_not_believed_stands_in_the_result() -> None:
+    taken = clean()
+    frame = replace(frame_of(taken), metadata=Metadata(not_believed=("EXIF orientation 3",)))
+    assert received(frame, options_for(taken)).message == "not believed: EXIF orientation 3"
+
+
 def test_a_screen_too_small_says_how_much_it_needs() -> None:
     """One packet at 8.65 kHz lasts 8.09 ms: 34 % of the 24.1 ms of a whole readout."""
     taken = clean()

@@ -22,6 +22,8 @@ from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
 #: Minimum number of cells of a row, several for every strip of a hundred columns; and of a picture rotated by 90
 #: degrees, which is searched for wide columns only.
 _MIN_CELLS, _TURNED_CELLS = 1500, 400
+#: Bits of the largest word of two lanes.
+_LARGEST_WORD = 64
 #: Rows read at a time, chosen to fit the processor's cache.
 BAND_ROWS = 64
 
@@ -76,6 +78,8 @@ def cells_of(band: NDArray[Any], cell_px: int) -> NDArray[Any]:
         band = np.ascontiguousarray(band)
     while cell_px > 1:
         half = 8 * band.dtype.itemsize
+        if half == _LARGEST_WORD:
+            return np.asarray(band.reshape(len(band), -1, cell_px).sum(axis=2))
         pairs = band.view(f"u{2 * band.dtype.itemsize}")
         band = pairs >> pairs.dtype.type(half)
         band += pairs & pairs.dtype.type((1 << half) - 1)

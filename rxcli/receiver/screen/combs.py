@@ -133,13 +133,14 @@ def _best_combs(rest: Float32Array, step: float, y: FloatArray, pitches: FloatAr
     bent = rest * _turned(float(pitches.mean()) * np.multiply.outer(across, x * x))[:, None]
     along_strips = np.matmul(bent, _waves(rest.shape[1], step, start, n_frequencies))
     over_windows = _turned(pitches[:, None, None] * np.multiply.outer(y, turns))
-    sums = np.matmul(along_strips[:, np.arange(y.size), nearest], over_windows).swapaxes(0, 1)
-    power, out = np.square(sums.real) + np.square(sums.imag), []
-    for number, pitch in enumerate(pitches.tolist()):
-        i, j, k = np.unravel_index(int(power[number].argmax()), power[number].shape)
-        phase = -float(np.angle(sums[number, i, j, k])) / (2 * np.pi)
+    out = []
+    for number, pitch in enumerate(pitches.tolist()):  # together they would take gigabytes in tall pictures
+        sums = np.matmul(along_strips[:, np.arange(y.size), nearest[number]], over_windows[number])
+        power = np.square(sums.real) + np.square(sums.imag)
+        i, j, k = np.unravel_index(int(power.argmax()), power.shape)
+        phase = -float(np.angle(sums[i, j, k])) / (2 * np.pi)
         shape = float(turns[k]), float(across[i]), float(along[j])
-        out.append(Comb(float(np.sqrt(power[number, i, j, k])), pitch, *shape, phase))
+        out.append(Comb(float(np.sqrt(power[i, j, k])), pitch, *shape, phase))
     return out
 
 

@@ -27,8 +27,9 @@ from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
 #: The next step where a picture is too dark.
 BRIGHTEN = "expose longer, raise ISO, or show a brighter picture on the screen"
-#: Minimum width and height of a picture, pixels, and minimum number of strips across it.
-MIN_SIZE_PX, _MIN_STRIPS = 96, 120
+#: Minimum width and height of a picture, pixels, its maximum height in widths, beyond which a grid in perspective may
+#: have columns of no width, and minimum number of strips across it.
+MIN_SIZE_PX, MAX_TALL, _MIN_STRIPS = 96, 6, 120
 #: Number of columns from which a screen's columns count as narrow, and parts of a picture that are searched for them.
 _NARROW_COLUMNS, _PARTS = 50, 5
 #: Factor by which the followed width of a grid of narrow columns grows at a time.
@@ -107,8 +108,8 @@ def shows_narrow(plane: LightPlane) -> bool:
 
 
 def _strips_of(plane: LightPlane, lens: Lens | None) -> Strips | None:
-    """The strips of a picture, or None if it is too small."""
-    if min(plane.width, plane.height) < MIN_SIZE_PX:
+    """The strips of a picture, or None if its size shows no screen."""
+    if size_refused(plane.width, plane.height):
         return None
     strips = read_strips(plane, lens)
     return strips if strips.lit.shape[1] >= _MIN_STRIPS else None
@@ -125,13 +126,23 @@ def _screens_apart(strips: Strips, layouts: Sequence[ColumnLayout]) -> list[list
     return [_numbered(side, grid, layouts) for side, grid in clearest_first]
 
 
+def size_refused(width: int, height: int) -> tuple[str, str] | None:
+    """Why a picture of a size can show no screen and the next step, or None."""
+    size = f"the picture has {width} x {height} pixels"
+    if min(width, height) < MIN_SIZE_PX:
+        step = "use the picture in its full size, not a thumbnail or a messenger's copy"
+        return f"{size}, a screen needs at least {MIN_SIZE_PX} each way", step
+    if height > MAX_TALL * width:
+        return f"{size}, more than {MAX_TALL} times as high as wide", "crop it to the screen"
+    return None
+
+
 def why_useless(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white: float) -> tuple[str, str] | None:
     """Why a picture cannot show a screen at all and the next step, or None."""
     height, width = pixels.shape
-    if min(height, width) < MIN_SIZE_PX:
-        min_px = MIN_SIZE_PX
-        size = f"the picture has {width} x {height} pixels, a screen needs at least {min_px} each way"
-        return size, "use the picture in its full size, not a thumbnail or a messenger's copy"
+    refused = size_refused(width, height)
+    if refused is not None:
+        return refused
     sample = thinned(pixels, black, white)
     if np.mean(sample >= 0.004) < 0.005:
         return "the picture is black", BRIGHTEN

@@ -159,8 +159,8 @@ def outside_the_picture(corners: FloatArray, frame: Frame) -> Failure | None:
 
 
 def may_fill(frame: Frame) -> bool:
-    """Whether the picture is large enough to receive a screen that fills it."""
-    return min(frame.width, frame.height) >= SETTINGS.min_rows
+    """Whether the picture is large enough, and not too tall, to receive a screen that fills it."""
+    return min(frame.width, frame.height) >= SETTINGS.min_rows and frame.height <= find.MAX_TALL * frame.width
 
 
 def whole_picture(frame: Frame) -> FloatArray:

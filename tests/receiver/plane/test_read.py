@@ -27,7 +27,7 @@ def outlines(lens: Lens | None = None, shift: float = 0.0) -> Outlines:
     return column_outlines(CORNERS + np.array([shift, 0.0]), 4, 3, 240, 120, lens)
 
 
-@pytest.mark.parametrize(("width", "cell_px"), [(240, 1), (3001, 2), (6243, 4), (12001, 8)])
+@pytest.mark.parametrize(("width", "cell_px"), [(240, 1), (3001, 2), (6243, 4), (12001, 8), (24001, 16)])
 def test_sums_of_8_bits_are_exact(width: int, cell_px: int) -> None:
     frame = frame_of(width, 7)
     plane = read_plane(frame)
@@ -38,7 +38,7 @@ def test_sums_of_8_bits_are_exact(width: int, cell_px: int) -> None:
     assert not plane.sums[0].any()
 
 
-@pytest.mark.parametrize("width", [240, 6243])
+@pytest.mark.parametrize("width", [240, 6243, 12001])
 def test_sums_of_16_bits_are_near(width: int) -> None:
     frame = frame_of(width, 7, np.uint16)
     means = np.diff(read_plane(frame).sums, axis=0) / read_plane(frame).cell_px

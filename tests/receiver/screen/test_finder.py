@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -487,3 +488,16 @@ def test_strips_are_read_of_any_height(height: int) -> None:
     """Only whole steps of rows count: of 1582 rows and steps of three the last one is a part."""
     noise = np.random.default_rng(1).integers(0, 255, (height, 40), np.uint8)
     assert read_strips(plane_of(noise)).height == height
+
+
+def test_a_tall_picture_takes_little_memory_or_is_refused() -> None:
+    """Combs are tried in steps of a column at the far end, so their number goes with the square of the height."""
+    noise = np.random.default_rng(6).integers(0, 255, (6000, 720), dtype=np.uint8)
+    assert find_screens(read_plane(Frame(noise[:, ::2], "memory")), [WIDE]) == []
+    assert "360 x 6000 pixels, more than 6 times as high" in str(why_useless(noise[:, ::2], 0, 255))
+    strips = read_strips(read_plane(Frame(noise[:4300], "memory")))
+    tracemalloc.start()
+    find_combs(strips, WIDE.sigma)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 20e6

@@ -1,0 +1,160 @@
+"""Stills that are not as their standards ask are read as plain files of the same pixels; damage is still reported."""
+
+from __future__ import annotations
+
+import io
+import lzma
+import struct
+import tracemalloc
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import odd_stills
+import pytest
+from ingest_files import BAYER, one_frame, read_all, write_dng
+from PIL import Image
+
+from rxcli.ingest import KNOWN_SUFFIXES
+from rxcli.ingest.heif import _bytes_a_pixel
+
+Y, X = np.mgrid[:48, :80]
+GREY = (3 * Y + X + 20 * (Y < 10) * (X > 60)).astype(np.uint8)
+PICTURE = np.repeat(GREY[:, :, None], 3, axis=2)
+JPEGS = odd_stills.odd_jpegs(PICTURE)
+PNGS, TIFFS = odd_stills.odd_pngs(PICTURE), odd_stills.odd_tiffs(PICTURE)
+NOISE = np.repeat(np.random.default_rng(4).integers(0, 255, (96, 160, 1), dtype=np.uint8), 3, axis=2)
+
+
+def written(path: Path, data: bytes) -> Path:
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("name", JPEGS)
+def test_jpeg(tmp_path: Path, name: str) -> None:
+    odd, plain = (one_frame(written(tmp_path / "a.jpg", data)) for data in JPEGS[name])
+    np.testing.assert_array_equal(odd.pixels, plain.pixels)
+    assert odd.metadata == plain.metadata
+
+
+@pytest.mark.parametrize("name", ["no_end", "no_end_progressive", "sampled", "no_end_trailer"])
+@pytest.mark.parametrize("kept", [0.5, 0.9])
+@pytest.mark.parametrize("end", [b"", b"\xff\xd9", bytes(3000)], ids=["cut", "ended", "filled"])
+def test_a_cut_jpeg_still_says_so(tmp_path: Path, name: str, kept: float, end: bytes) -> None:
+    data = odd_stills.odd_jpegs(NOISE)[name][0]
+    size = data.index(b"SEFH") if "trailer" in name else len(data)
+    frames, error = read_all(written(tmp_path / "a.jpg", data[: int(kept * size)] + end))
+    assert not frames
+    assert ("is damaged" if end == b"\xff\xd9" else "is cut: ") in str(error)
+
+
+@pytest.mark.parametrize("name", PNGS)
+def test_png_with_a_wrong_check_sum_that_decides_no_pixel(
+    tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    frame = one_frame(written(tmp_path / "a.png", PNGS[name]))
+    np.testing.assert_array_equal(frame.pixels, GREY)
+    assert frame.metadata.orientation == (3 if name == "eXIf" else 1)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("name", TIFFS)
+def test_tiff(tmp_path: Path, name: str) -> None:
+    frame = one_frame(written(tmp_path / "a.tif", TIFFS[name]))
+    shown = GREY * (255 / GREY.max()) if frame.linear else GREY
+    np.testing.assert_allclose(frame.pixels * (255 / frame.white), shown, atol=2 if name == "jpeg" else 0.5)
+    assert frame.linear is name.startswith("float")
+    assert frame.metadata.make in (None, "Example")
+
+
+@pytest.mark.parametrize(("name", "options"), [("a.webp", {"lossless": True}), ("a.webp", {}), ("a.jfif", {})])
+def test_orientation_is_that_of_the_exif(tmp_path: Path, name: str, options: dict[str, bool]) -> None:
+    exif = odd_stills.exif_bytes(orientation=3)
+    Image.fromarray(GREY).save(tmp_path / name, "JPEG" if "jfif" in name else "WEBP", exif=exif, **options)
+    frame = one_frame(tmp_path / name)
+    assert frame.metadata.orientation == 3
+    np.testing.assert_allclose(frame.pixels, GREY, atol=20)
+
+
+def test_a_heic_that_is_not_turned_itself_keeps_its_order_and_says_so(tmp_path: Path) -> None:
+    pillow_heif = pytest.importorskip("pillow_heif", reason="needs the extra `heic`")
+    out, exif = io.BytesIO(), [odd_stills.exif_bytes(orientation) for orientation in (1, 3)]
+    pillow_heif.from_pillow(Image.fromarray(PICTURE)).save(out, exif=exif[0])
+    frame = one_frame(written(tmp_path / "a.heic", out.getvalue().replace(*exif)))
+    assert frame.metadata.orientation == 1
+    assert "EXIF orientation 3" in frame.metadata.not_believed[0]
+
+
+def test_a_heic_of_108_megapixels_fits_in_half_a_gigabyte() -> None:
+    file = SimpleNamespace(mode="RGB", has_alpha=False, info={"bit_depth": 8, "chroma": 420})
+    assert 12_000 * 9_000 * _bytes_a_pixel(file, is_turned=False) < 0.5e9
+    deep = SimpleNamespace(mode="RGB;16", has_alpha=False, info={"bit_depth": 10, "chroma": 420})
+    assert 12_000 * 9_000 * _bytes_a_pixel(deep, is_turned=False) < 1.25e9
+
+
+@pytest.mark.parametrize(
+    ("compression", "part", "n_parts", "tile_px", "reason"),
+    [
+        (8, odd_stills.unfolding(200), 1, 0, "cannot be read"),
+        (8, odd_stills.unfolding(40), 10, 0, "cannot be read"),
+        (8, odd_stills.unfolding(1), 1, 65520, "would take 4.3 GB"),
+        (34925, lzma.compress(bytes(1 << 27), preset=0), 4, 0, None),
+        (
+            7,
+            odd_stills.grey_jpeg(GREY).replace(struct.pack(">HH", *GREY.shape), b"\xff\xd0" * 2),
+            1,
+            0,
+            "a JPEG larger",
+        ),
+        (34712, b"x", 1, 0, "compression is JPEG2000"),
+    ],
+)
+def test_a_tiff_unfolds_to_its_size_at_most(
+    tmp_path: Path, compression: int, part: bytes, n_parts: int, tile_px: int, reason: str | None
+) -> None:
+    path = written(tmp_path / "a.tif", odd_stills.bomb_tiff(compression, part, n_parts, tile_px))
+    one_frame(written(tmp_path / "b.tif", TIFFS["packbits"]))  # imports
+    tracemalloc.start()
+    frames, error = read_all(path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 16e6
+    assert reason in str(error) if reason else frames[0].pixels.shape == (1000, 1000)
+
+
+def test_strips_that_share_their_bytes_are_read_once(tmp_path: Path) -> None:
+    data = odd_stills.bomb_tiff(1, bytes(100_000), 500)
+    at = data.index(struct.pack("<II", *([100_000] * 2))) - 4 * 500
+    shared = data[:at] + data[at : at + 4] * 500 + data[at + 4 * 500 :]
+    _, error = read_all(written(tmp_path / "a.tif", shared[: len(data) - 499 * 100_000]))
+    assert "claim more than the file holds" in str(error)
+
+
+def test_a_dng_of_jpeg_xl_is_not_told_to_become_one(tmp_path: Path) -> None:
+    path = write_dng(tmp_path / "a.dng", np.full((64, 96), 500, np.uint16), BAYER)
+    entry = struct.Struct("<HHIH")
+    written(path, path.read_bytes().replace(entry.pack(259, 3, 1, 1), entry.pack(259, 3, 1, 52546)))
+    _, error = read_all(path)
+    assert "compressed as JPEG XL, which LibRaw does not read; set the camera's RAW files" in str(error)
+
+
+def test_folders_hold_pictures_of_these_names() -> None:
+    assert {".jfif", ".mpo", ".hif"} <= KNOWN_SUFFIXES
+
+
+def test_collected_files_are_as_their_plain_twin(shared_cases: Path) -> None:
+    folder = shared_cases / "stills"
+    plain = one_frame(folder / "plain.jpg").pixels
+    for path in sorted(folder.iterdir()):
+        frame = one_frame(path)
+        if path.name == "heic_108mp.heic":
+            assert frame.pixels.shape == (9000, 12000)
+            continue
+        values = frame.pixels / frame.white
+        values = (
+            np.where(values <= 0.0031308, 12.92 * values, 1.055 * values ** (1 / 2.4) - 0.055)
+            if frame.linear
+            else values
+        )
+        assert np.abs(255 * values - plain).mean() < 4, path.name
