@@ -100,6 +100,15 @@ def reason_of(error: BaseException) -> str:
     return " ".join(str(text).split())[:160]
 
 
+#: How libraries that cannot be loaded, threads that cannot be started and C code state a lack of memory.
+_NO_MEMORY = re.compile(r"failed to map segment|allocate memory|start new thread|nsufficient memory|bad_alloc")
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether an exception of any type is for want of memory."""
+    return isinstance(error, MemoryError) or bool(_NO_MEMORY.search(str(error)))
+
+
 def shortened(text: str, length: int = 80) -> str:
     """`text` cut to a length, so that a message stays one line."""
     return text if len(text) <= length else f"{text[: length - 3]}..."

@@ -7,6 +7,7 @@ Times in seconds, lengths in pixels of the stored picture (integer coordinates a
 from __future__ import annotations
 
 import logging
+import os
 import re
 import tomllib
 from collections.abc import Iterable
@@ -279,7 +280,7 @@ def _file_of(name: str, kind: type[Any]) -> Path:
     if NAME.fullmatch(name) is None:
         return Path(name)
     by_name = (folder / _KINDS[kind] / f"{name}.toml" for _, folder in profile_dirs())
-    return next((path for path in by_name if path.is_file()), Path(name))
+    return next((path for path in by_name if os.path.isfile(path)), Path(name))
 
 
 def _profile_files(kind: type[Any]) -> list[tuple[str, Path]]:

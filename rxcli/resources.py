@@ -46,12 +46,15 @@ def user_dir() -> Path:
         return Path(home)
     from platformdirs import user_config_path
 
-    return user_config_path("vlc-rx", appauthor=False)
+    path = user_config_path("vlc-rx", appauthor=False)
+    # Without a home it would be a folder of the current one, which may be anybody's.
+    return path if path.is_absolute() else Path(os.devnull, f"no home, set {HOME_VARIABLE}")
 
 
 def profile_dirs() -> list[tuple[str, Path]]:
-    """Folders with `cameras/` and `screens/` and their origin; the first profile of a name wins."""
-    return [("user", user_dir()), ("shipped", data_dir("calibration"))]
+    """Readable folders with `cameras/` and `screens/` and their origin; the first profile of a name wins."""
+    places = [("user", user_dir()), ("shipped", data_dir("calibration"))]
+    return [(origin, folder) for origin, folder in places if os.path.isdir(folder)]
 
 
 def onnx_runtime() -> Any:

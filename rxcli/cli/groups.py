@@ -35,6 +35,17 @@ class PlainContext(click.Context):
     formatter_class = PlainFormatter
 
 
+def help_of(command: click.Command) -> str | None:
+    """The help of a command, which is a docstring; `python -OO` drops those, and it is read from the source."""
+    if command.help or command.callback is None:
+        return command.help
+    import ast
+    import inspect
+
+    tree = ast.parse(inspect.getsource(command.callback)).body[0]
+    return ast.get_docstring(tree) if isinstance(tree, ast.FunctionDef) else None
+
+
 class SuggestingGroup(click.Group):
     """A group that names the nearest command where one is mistyped, and lays out its commands' help."""
 
@@ -43,7 +54,7 @@ class SuggestingGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         command = super().get_command(ctx, cmd_name)
         if command is not None:
-            command.context_class = PlainContext
+            command.context_class, command.help = PlainContext, help_of(command)
         return command
 
     def resolve_command(

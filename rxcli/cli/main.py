@@ -13,6 +13,7 @@ import logging
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
@@ -21,8 +22,8 @@ from typing import Any
 import click
 
 from rxcli import __version__
-from rxcli.cli.groups import SuggestingGroup
-from rxcli.errors import ExitCode, OutputError, ReceiverError, Terminated, printable
+from rxcli.cli.groups import SuggestingGroup, help_of
+from rxcli.errors import ExitCode, OutputError, ReceiverError, Terminated, is_out_of_memory, printable
 
 _COMMANDS = {
     "demo": "Try it without a screen: a simulated photo with a text.",
@@ -114,7 +115,7 @@ def cli(context: click.Context) -> None:
     from rxcli.resources import user_dir
 
     path = user_dir() / "config.toml"
-    if path.is_file():
+    if os.path.isfile(path):  # in a home that may be unreadable
         from rxcli.cli.config import option_defaults
 
         context.default_map = dict.fromkeys(_COMMANDS, option_defaults(path))
@@ -127,14 +128,21 @@ def main() -> None:
     _reserve_standard_streams()
     os.environ["PYTHONSAFEPATH"] = "1"  # no child takes modules from the current folder
     sys.path[:] = filter(None, sys.path)
-    signal.signal(signal.SIGTERM, _terminate)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _end)
+    cli.help = help_of(cli)
     code = run(sys.argv[1:])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run has ended, and its exit code stands
     gc.freeze()  # else the interpreter looks for garbage among all objects once more before it ends
     sys.exit(code)
 
 
-def _terminate(_number: int, _frame: object) -> None:
-    raise Terminated
+def _end(number: int, _frame: object) -> None:
+    """End the run with its summary, which a second signal does not disturb; one after a second ends it at once."""
+    begun_s = time.monotonic()
+    for other in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(other, lambda *_: time.monotonic() > begun_s + 1 and os._exit(128 + number))
+    raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
 
 def _reserve_standard_streams() -> None:
@@ -195,7 +203,7 @@ def _explained(error: BaseException) -> tuple[str, ExitCode]:
         case OSError():
             reason = f"{error.filename}: {error.strerror or error}"
             return f"{reason}; make room or correct the permissions, and try again", ExitCode.UNREADABLE
-        case MemoryError():
+        case _ if is_out_of_memory(error):
             step = "decode fewer or smaller files at a time"
             return f"more memory is needed than there is; {step}", ExitCode.UNREADABLE
     logging.getLogger("rxcli").debug("internal error", exc_info=error)

@@ -38,10 +38,8 @@ def serve(device: Path | None, **options: Any) -> int:
     import asyncio
 
     site = _site(device, options)
-    try:
-        asyncio.run(_run(site))
-    except KeyboardInterrupt:
-        click.echo("stopped", err=True)
+    asyncio.run(_run(site))
+    click.echo("stopped", err=True)
     return ExitCode.OK
 
 
@@ -78,7 +76,7 @@ async def _run(site: Site) -> None:
     from rxcli.web.server import Server
 
     stopped = asyncio.Event()
-    for number in (signal.SIGTERM, signal.SIGHUP):  # before there is anything to leave behind
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # before there is anything to leave behind
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     async with Server(site) as server:
         if site.token is not None:

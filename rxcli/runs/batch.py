@@ -12,7 +12,7 @@ import signal
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
 from itertools import chain, islice
@@ -21,7 +21,7 @@ from threading import Lock, Semaphore, Thread, local
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError, reason_of
+from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError, is_out_of_memory, reason_of
 from rxcli.ingest import open_source
 from rxcli.link.collector import Collector
 from rxcli.options import ReceiverOptions
@@ -217,8 +217,8 @@ def _problem(error: Exception, source: Source) -> str:
     """Message of an error in a source; one that is no `ReceiverError` is a bug, whose traceback goes to the log."""
     if isinstance(error, ReceiverError):
         return str(error).replace(source.path, source.name)
-    if isinstance(error, (OSError, MemoryError)):
-        reason = "more memory is needed than there is" if isinstance(error, MemoryError) else reason_of(error)
+    if isinstance(error, OSError) or is_out_of_memory(error):
+        reason = "more memory is needed than there is" if is_out_of_memory(error) else reason_of(error)
         return f"{source.name}: cannot be decoded ({reason}); try it by itself"
     log.debug("unexpected error", exc_info=error)
     return f"internal error ({type(error).__name__}: {error}); run again with --verbose and report it"
@@ -257,7 +257,13 @@ def standard_decoder(
 
 def _receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
     """Receive frames; the receiver is imported while the first frame is read."""
-    loading = Thread(target=lambda: [import_module(name) for name in _LOADED], daemon=True)
+
+    def load() -> None:
+        with suppress(Exception):  # which is raised again below
+            for name in _LOADED:
+                import_module(name)
+
+    loading = Thread(target=load, daemon=True)
     loading.start()
     frames = iter(frames)
     try:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 import pytest
@@ -117,6 +118,57 @@ def test_no_module_is_taken_from_the_current_folder(way: str, tmp_path: Path) ->
     done = subprocess.run([*command, "decode", ".", "--workers", "2"], cwd=photos, env=ENVIRONMENT, check=False)
     assert done.returncode == 3
     assert not (tmp_path / "loaded").exists()
+
+
+def started(*command: str, **told: str) -> subprocess.CompletedProcess[str]:
+    whole = [sys.executable, "-m", "rxcli.cli.main", *command]
+    return subprocess.run(whole, env=ENVIRONMENT | told, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("command", ["--help", "decode --help", "calibrate --help", "calibrate shutter --help"])
+def test_help_is_the_same_without_docstrings(command: str) -> None:
+    plain, optimised = (started(*command.split(), PYTHONOPTIMIZE=level) for level in ("", "2"))
+    assert optimised.stdout == plain.stdout
+    assert optimised.returncode == 0
+
+
+def test_a_machine_without_room_for_the_libraries_is_told_so() -> None:
+    photo = Path(__file__).resolve().parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
+    command = f"ulimit -v 400000; exec {sys.executable} -m rxcli.cli.main decode --quiet {photo}"
+    done = subprocess.run(["bash", "-c", command], env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert done.returncode == 3
+    assert (
+        done.stderr == f"vlc-rx: {photo}: cannot be decoded (more memory is needed than there is); try it by itself\n"
+    )
+
+
+def test_without_a_home_nothing_is_taken_from_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where no home is known, `~` is a name like any other."""
+    (tmp_path / "~" / ".config" / "vlc-rx").mkdir(parents=True)
+    (tmp_path / "~" / ".config" / "vlc-rx" / "config.toml").write_text("workers = 0")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("VLC_RX_HOME")
+    monkeypatch.setattr("platformdirs.user_config_path", lambda *_, **__: Path("~/.config/vlc-rx"))
+    assert run(["profiles"]) == 0
+    assert "no home, set VLC_RX_HOME" in capsys.readouterr().out
+
+
+def test_a_home_that_may_not_be_read_is_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stat = os.stat
+
+    def refusing(path: Any, *arguments: Any, **more: Any) -> os.stat_result:
+        if str(path).startswith(str(tmp_path)):
+            raise PermissionError(13, "Permission denied", str(path))
+        return stat(path, *arguments, **more)
+
+    monkeypatch.setenv("VLC_RX_HOME", str(tmp_path))
+    monkeypatch.setattr(os, "stat", refusing)
+    assert run(["profiles", "show", "xs10"]) == 0
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])

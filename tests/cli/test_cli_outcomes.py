@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -299,15 +300,28 @@ def test_what_is_no_number_is_none_for_any_option(
 # -- how runs end
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_signal_ends_the_run_with_its_summary(tmp_path: Path, number: int, code: int, workers: int) -> None:
+@pytest.mark.parametrize(
+    ("number", "code", "workers", "pause_s"),
+    [
+        (signal.SIGTERM, 143, 1, None),
+        (signal.SIGINT, 130, 1, None),
+        (signal.SIGTERM, 143, 2, None),
+        *((signal.SIGINT, 130, 2, pause_s) for pause_s in (0.0, 0.02, 0.05)),
+    ],
+)
+def test_a_signal_ends_the_run_with_its_summary(
+    tmp_path: Path, number: int, code: int, workers: int, pause_s: float | None
+) -> None:
+    """So does one that is repeated after a pause, by a person who does not wait."""
     folder, summary, junit = many(tmp_path / "in", 3000), tmp_path / "s.csv", tmp_path / "j.xml"
     options = ["--json", "-", "--summary", summary, "--junit", junit, "--workers", workers]
     started = start("decode", folder, *options, stdout=subprocess.PIPE)
     assert started.stdout is not None
     assert started.stdout.readline().startswith(b'{"source"')
     started.send_signal(number)
+    if pause_s is not None:
+        time.sleep(pause_s)
+        started.send_signal(number)
     _, said = started.communicate(timeout=60)
     assert started.returncode == code
     assert b"Traceback" not in said
