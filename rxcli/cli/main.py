@@ -140,8 +140,8 @@ def main() -> None:
 def _end(number: int, _frame: object) -> None:
     """End the run with its summary, which a second signal does not disturb; one after a second ends it at once."""
     begun_s = time.monotonic()
-    for other in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(other, lambda *_: time.monotonic() > begun_s + 1 and os._exit(128 + number))
+    for ending in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(ending, lambda *_: time.monotonic() > begun_s + 1 and os._exit(128 + number))
     raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
 
 
