@@ -38,7 +38,7 @@ _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_ra
 @click.command()
 @click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
 @options(
-    ("--preset", PRESETS, "xs10-still", "Kind of camera."),
+    ("--preset=NAME", PRESETS, "xs10-still", f"Kind of camera: {', '.join(PRESETS)}."),
     ("--screen", str, "paper-34k6", "Screen profile: a name or a TOML file."),
     ("--picture", str, "coffee", "Picture shown: a file, or a name (see --list)."),
     ("--payload", str, "random", "'random', 'hex:...', or a file; sent over and over."),
