@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from rxcli.errors import printable, sentence
+from rxcli.receiver.decode.assemble import OUT_OF_VIEW
 from rxcli.types import FloatArray, Frame, FrameResult
 
 #: Rates are averages over this time, seconds.
@@ -86,7 +87,7 @@ class AimState:
     ber_hat: float | None = None
     light: Light | None = None
     height_share: float | None = None
-    #: Why there is no lock, and what to do; empty where there is one, but for a hand that shakes too much.
+    #: Why there is no lock, and what to do; with a lock, only of a hand that shakes and a screen partly out of view.
     reason: str = ""
     advice: str = ""
 
@@ -116,6 +117,10 @@ class Aim:
             self._recent.popleft()
         locked = result.status in _LOCKED
         reason, advice = ("", "") if locked else aiming_hint(result, light)
+        n_hidden = sum(column.message == OUT_OF_VIEW for column in result.columns)
+        if locked and n_hidden:
+            reason = f"{n_hidden} of the screen's columns are out of the picture."
+            advice = sentence(OUT_OF_VIEW.partition("; ")[2])
         n_received = sum(column.status in ("ok", "weak") for column in result.columns) if locked else 0
         moved = self._moved(result.corners, height)
         if moved > _STILL and n_received <= _FEW * len(result.columns):

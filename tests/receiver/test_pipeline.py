@@ -208,7 +208,8 @@ def test_every_pixel_of_a_still_is_read_once() -> None:
     taken = clean()
     assert n_reads(frame_of(taken), options_for(taken)) == (1.0, "ok")
     searched = ReceiverOptions(cameras=(), skip=frozenset())
-    assert n_reads(frame_of(taken), searched)[0] == pytest.approx(1.0, abs=0.05)
+    # Some lines of this narrow picture are read again to explain the refusal.
+    assert 1.0 <= n_reads(frame_of(taken), searched)[0] < 1.3
 
 
 def test_every_pixel_of_a_picture_without_a_screen_is_read_once_and_some_for_the_message() -> None:

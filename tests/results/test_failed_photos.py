@@ -23,7 +23,7 @@ from rxcli.web.decoding import answer_for
 PHOTOS = {
     "too dark": ("it is dark (5 % of white on average)", "expose longer, raise ISO, or show a brighter picture"),
     "portrait": (
-        "as in portrait or where a picture was turned after it was taken",
+        "its columns lie along the rows, as in portrait or where a picture was turned after it was taken",
         "use the camera's own file, taken in landscape",
     ),
     "ordinary": ("no columns of a modulated backlight were found in the picture", "photograph a screen that sends"),

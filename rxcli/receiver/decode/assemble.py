@@ -30,6 +30,7 @@ _HEADERLESS = (
     "all), its place wrong (--corners), or the column overexposed"
 )
 ECHO = "it shows nothing but the light of the column beside it; show a brighter picture there"
+OUT_OF_VIEW = "it is out of the picture; turn the camera, or move back, until the whole screen is in view"
 _GOES_ON = "its burst goes on in the next frame and is reported there"
 
 
@@ -232,6 +233,8 @@ def _withheld(confidence: float, min_confidence: float) -> str | None:
 
 def _incomplete_reason(n_observed: IntArray) -> str:
     """Message for a column without a complete packet; `n_observed` is (B, packet)."""
+    if not n_observed.any():
+        return OUT_OF_VIEW
     missing = int((n_observed[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
     return (
         f"no packet is in view as a whole: of {n_observed.shape[1]} slots {missing} are missing; move closer so that "

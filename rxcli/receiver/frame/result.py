@@ -38,7 +38,10 @@ class Received(NamedTuple):
 
     def with_remark(self, remark: str | None) -> Received:
         """The same with a remark before the message, if there is one."""
-        message = "; ".join(filter(None, (remark, self.result.message))) or None
+        return self.with_message("; ".join(filter(None, (remark, self.result.message))) or None)
+
+    def with_message(self, message: str | None) -> Received:
+        """The same with another message."""
         return self._replace(result=replace(self.result, message=message))
 
 

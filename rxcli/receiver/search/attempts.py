@@ -11,7 +11,8 @@ from rxcli.receiver.frame.camera import FrameCamera
 from rxcli.receiver.frame.result import Failure, Received, failed
 from rxcli.receiver.plane import orientation
 from rxcli.receiver.search.cameras import known_camera
-from rxcli.receiver.search.outlines import ON_ITS_SIDE, lies_on_its_side, unreadable_orientation
+from rxcli.receiver.search.outlines import ON_ITS_SIDE, lean_on_its_side, unreadable_orientation
+from rxcli.receiver.search.refusal import likeliest_reason
 from rxcli.types import Frame, FrameResult
 
 _UPSIDE_DOWN = (
@@ -36,27 +37,32 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
     if received.n_believable:
         remark = _UPSIDE_DOWN if _is_reversed(received.result) else _AS_STORED if asks_for_turn else None
         return received.with_remark(remark)
-    if options.corners is not None or frame.mosaic is not None or not lies_on_its_side(upright, options):
+    if options.corners is not None:
         return received
+    lean = lean_on_its_side(upright, options)
+    if not lean:
+        return received.with_message(likeliest_reason(frame, received.result, options))
     attempts = []
-    for quarter_turns in orientation.QUARTER_TURNS:
+    for quarter_turns in orientation.QUARTER_TURNS if lean < 0 else ():
         back = orientation.turned_frame(frame, quarter_turns)
-        attempt = _receive_stated(FrameCache(back, cache.timer), options, receive)
-        result, n_packets = orientation.as_stored(back, attempt.result, quarter_turns), attempt.n_believable
-        rank = n_packets * (not _is_reversed(result)), n_packets, quarter_turns
-        attempts.append((rank, attempt._replace(result=result)))
-    (_, n_packets, quarter_turns), best = max(attempts, key=lambda attempt: attempt[0])
-    if n_packets:
+        attempt = receive(FrameCache(back, cache.timer), options)
+        result = orientation.as_stored(back, attempt.result, quarter_turns)
+        if not _gives_few(result):
+            rank = not _is_reversed(result), attempt.n_believable, quarter_turns
+            attempts.append((rank, attempt._replace(result=result)))
+    if attempts:
+        (*_, quarter_turns), best = max(attempts, key=lambda attempt: attempt[0])
         return best.with_remark(orientation.remark(quarter_turns))
     failure = unreadable_orientation(frame) or Failure("no_screen", f"no screen found: {ON_ITS_SIDE}")
-    return Received(failed(received.result, failure), {})
+    return Received(failed(FrameResult(frame.source, frame.index, frame.time_s, "ok"), failure), {})
 
 
 def _receive_stated(cache: FrameCache, options: ReceiverOptions, receive: _Receive) -> Received:
     """Receive a frame as profile and file state its camera; where few columns give packets, also as it is estimated."""
-    best = stated = receive(cache, options)
+    best = stated = received = receive(cache, options)
     for attempt, estimating in _with_estimates(cache, options):
-        if not _gives_few(best.result):
+        # Without a hypothesis of the camera its exposure did not count.
+        if not _gives_few(best.result) or (attempt is not cache and not received.result.search):
             break
         received = receive(attempt, estimating)
         if received.n_believable > best.n_believable and _is_credible(received.result, cache.frame, options):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
@@ -16,6 +18,7 @@ from rxcli.receiver.plane.orientation import PORTRAIT
 from rxcli.receiver.screen import find, geometry
 from rxcli.receiver.screen.bright import bright_quadrilateral, striped_box
 from rxcli.receiver.screen.outline import Outline
+from rxcli.receiver.screen.stripes import MIN_LEAN, stripe_lean
 from rxcli.receiver.search.cameras import known_lens
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.types import FloatArray, Frame
@@ -27,10 +30,10 @@ _TOO_SLOW = (
 #: stripes, is the whole screen, if it shows packets; and the share of its width within which corners are the same.
 _BRIGHT_LOG_ODDS, _BRIGHT_CERTAINTY, _SAME_OUTLINE = -50.0, 0.9, 0.025
 ON_ITS_SIDE = (
-    "the screen's columns lie along the rows of the picture, as in portrait or where a picture was turned after it was "
-    "taken; use the camera's own file, taken in landscape"
+    "if the picture shows a screen that sends, its columns lie along the rows, as in portrait or where a picture was "
+    "turned after it was taken; use the camera's own file, taken in landscape"
 )
-_NO_COLUMNS = "no columns of a modulated backlight were found in the picture"
+NO_COLUMNS = "no columns of a modulated backlight were found in the picture"
 _SHOW_COLUMNS = (
     "photograph a screen that sends, from near, with the electronic shutter and a short exposure (1/8000 s), and use "
     "the picture in its full size"
@@ -78,7 +81,7 @@ def _viewed(outline: Outline, frame: Frame) -> Outline:
 
 def no_screen(cache: FrameCache, options: ReceiverOptions) -> Failure:
     """Failure of a picture without a screen."""
-    reason = ON_ITS_SIDE if lies_on_its_side(cache, options) else reason_for_none(cache.frame)
+    reason = ON_ITS_SIDE if lean_on_its_side(cache, options) else reason_for_none(cache.frame)
     if bright_quadrilateral(cache.plane) is not None:
         reason += "; if the bright part is the screen, it is lit without slots"
     return Failure("no_screen", f"no screen found: {reason}")
@@ -170,11 +173,34 @@ def whole_picture(frame: Frame) -> FloatArray:
     return geometry.viewer_order(corners, frame.metadata.orientation)
 
 
-def lies_on_its_side(cache: FrameCache, options: ReceiverOptions) -> bool:
-    """Whether columns lie along the rows of a picture. Of a clip only the first frame is examined."""
-    wide = [layout for layout in layouts_of(options) if not layout.is_narrow]
-    screens = [] if cache.frame.index else find.find_screens(turned(cache.plane), wide)
-    return any(screen[0].stands_out for screen in screens)
+def lean_on_its_side(cache: FrameCache, options: ReceiverOptions) -> float:
+    """Lean of the stripes (see `stripe_lean`) of a screen whose columns lie along the picture's rows; 0 of others.
+
+    Negative: the picture was turned after it was taken; positive: it was taken in portrait. Of a clip only the first
+    frame is examined.
+    """
+    frame = cache.frame
+    if frame.index or not may_fill(frame) or frame.mosaic is not None:
+        return 0.0
+    plane = turned(cache.plane)
+    screens = find.find_screens(plane, [layout for layout in layouts_of(options) if not layout.is_narrow])
+    corners = next((screen[0].corners for screen in screens if screen[0].stands_out), None)
+    if corners is None:
+        return 0.0
+    # Rows of the turned plane are columns of the picture.
+    shares = np.clip(corners[:, ::-1] / [plane.height, plane.width], 0, 1)
+    lean = stripe_lean(part_of(frame.pixels, shares * [frame.width, frame.height]))
+    return lean if abs(lean) >= MIN_LEAN else 0.0
+
+
+def part_of(pixels: NDArray[Any], corners: FloatArray | None) -> NDArray[Any]:
+    """The part of a picture that corners (n, 2) span; all of it if it is small or there are none."""
+    if corners is None:
+        return pixels
+    limits = [pixels.shape[1], pixels.shape[0]]
+    (left, top), (right, bottom) = (np.clip(edge(corners, axis=0), 0, limits).astype(int) for edge in (np.min, np.max))
+    part = pixels[top:bottom, left:right]
+    return part if min(part.shape) >= SETTINGS.min_rows else pixels
 
 
 def reason_for_none(frame: Frame) -> str:
@@ -184,8 +210,8 @@ def reason_for_none(frame: Frame) -> str:
     useless = find.why_useless(frame.pixels, black, white)
     mean = float(find.thinned(frame.pixels, black, white).mean())
     if useless is None and mean < SETTINGS.dark_mean:
-        return f"{_NO_COLUMNS}, and it is dark ({max(100 * mean, 0):.0f} % of white on average); {find.BRIGHTEN}"
-    return "; ".join(useless or (_NO_COLUMNS, _SHOW_COLUMNS))
+        return f"{NO_COLUMNS}, and it is dark ({max(100 * mean, 0):.0f} % of white on average); {find.BRIGHTEN}"
+    return "; ".join(useless or (NO_COLUMNS, _SHOW_COLUMNS))
 
 
 def too_small(context: FrameContext, screen: ScreenProfile) -> str | None:

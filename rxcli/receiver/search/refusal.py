@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rxcli.options import ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver.camera.advice import NO_HEADERS
 from rxcli.receiver.decode import assemble
@@ -18,20 +19,50 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception, dark_columns, shows_steady_light
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.frame.settings import SETTINGS as PASSES
+from rxcli.receiver.screen.stripes import MIN_LEAN, stripe_lean
 from rxcli.receiver.search.hypothesis import Hypothesis
-from rxcli.receiver.search.outlines import too_small
+from rxcli.receiver.search.outlines import NO_COLUMNS, part_of, too_small
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import as_one_column
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import RowProfiles
+from rxcli.types import BELIEVABLE, Frame, FrameResult, RowProfiles
 
 _NEXT = "point the camera at the screen that sends, or check that it does"
 STEADY_LIGHT = (
     f"this light is switched on and off steadily (PWM), as lamps and dimmed screens do, and carries no data; {_NEXT}"
 )
 _ONE_LAMP = f"all columns show the same light and no packets in it, as of a single lamp; {_NEXT}"
+_UNSURE = "no packet is sure; show a brighter picture or move closer"
+_SHORTER = "expose for 1/8000 s or less, with the electronic shutter, HDR and night mode off"
 _NO_HEADER = "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
+
+
+def likeliest_reason(frame: Frame, result: FrameResult, options: ReceiverOptions) -> str | None:
+    """Message of a refusal that begins with what is likeliest: no screen that sends, or a long exposure.
+
+    Args:
+        frame: the picture.
+        result: without a believable packet.
+        options: with the screens that were tried.
+    """
+    message, exposure_s = result.message or _UNSURE, frame.metadata.exposure_s or 0.0
+    # A packet of an uncertain column is still a packet.
+    is_sent = any(packet.confidence > BELIEVABLE * result.column_certainty for packet in result.packets)
+    if is_sent or message.startswith((STEADY_LIGHT, _ONE_LAMP)) or frame.mosaic is not None:
+        return result.message
+    slots = exposure_s * min(screen.slot_rate_hz for screen in options.screens)
+    fades = ""
+    if slots > SETTINGS.max_named_slots:
+        stated = f"{1e6 * exposure_s:.0f} us" if exposure_s < 1e-3 else f"{1e3 * exposure_s:.3g} ms"
+        fades = f"the exposure of {stated} that the file states lasts {slots:.0f} slots or more, in which stripes fade"
+    reason, _, advice = message.partition("; ")
+    if result.status == "no_screen":
+        return f"{reason}, and {fades}; {advice}" if fades and reason.endswith(NO_COLUMNS) else message
+    if stripe_lean(part_of(frame.pixels, result.corners)) < MIN_LEAN:
+        doubt = "the picture may show no screen that sends: no stripes run across it"
+        return f"{doubt}, and {fades}; {_SHORTER}" if fades else f"{doubt}; if it does, {message}"
+    return f"{fades}; {_SHORTER}" if fades else result.message
 
 
 def light_without_data(context: FrameContext, reception: Reception) -> Failure | None:

@@ -52,6 +52,8 @@ class SearchSettings:
     min_overlap: float = 0.002
     #: Minimum number of rows for blind camera estimation.
     min_rows: int = 24
+    #: Exposure, in slots of the slowest screen that was tried, from which it is named as the reason for a refusal.
+    max_named_slots: float = 3.0
     #: Mean, as a share of white, below which a picture without a screen is reported as dark.
     dark_mean: float = 0.08
     #: Largest size of an outline relative to the picture, beyond which less than one column is visible.
