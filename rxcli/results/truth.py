@@ -2,12 +2,16 @@
 
 A packet is *expected*, once per source and column, when some frame shows its burst for at least 1.02 packet lengths. It
 is *lost* when nothing was reported for it or more than a quarter of its bits are wrong. A reported packet is *false*
-when it differs in more than a quarter of its bits from every burst of its frame and of the frame before.
+when it differs in more than a quarter of its bits from every burst of its frame and of the frame before. A packet that
+several bursts send is received in all of them.
+
+The truth of a transmission (`vlc-rx encode --truth`) knows no frames. The packets of all columns of a frame then find
+its bursts together, and the bursts that were found are expected; where none was, one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sized
+from collections.abc import Iterable, Iterator, Sized
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from string import hexdigits
@@ -26,6 +30,8 @@ TRUTH_SUFFIX = ".truth.json"
 EXPECTED_LENGTHS = 1.02
 #: Above this share of wrong bits a packet is lost or false.
 MAX_WRONG_SHARE = 0.25
+#: Share of the best burst's agreement from which a frame shows another burst of a transmission, too.
+_ALSO_SHOWN = 0.3
 
 #: Longer truths than those of hours of video are none.
 _MAX_BYTES = 1 << 28
@@ -56,7 +62,8 @@ class Truth(msgspec.Struct, frozen=True, kw_only=True):
     w: tuple[int, ...]
     #: Payload bits of one packet, per column.
     payload_bits: tuple[Annotated[int, Meta(ge=0, le=7000)], ...]
-    frames: tuple[TruthFrame, ...]
+    #: None are known of a transmission, any part of which may have been photographed.
+    frames: tuple[TruthFrame, ...] = ()
     #: Burst number -> one hex string per column, first bit most significant.
     payload: dict[int, tuple[str, ...]]
     screen: str | None = None
@@ -111,6 +118,8 @@ def _contradictions(truth: Truth) -> Iterator[str]:
             yield f"{name} must have one entry per column, {truth.columns} (got {len(values)})"
     for w in sorted(set(truth.w) - set(WEIGHTS)):
         yield f"w must be in 1..9 (got {w})"
+    if not truth.payload:
+        yield "no payload is known; name the file that vlc-rx encode --truth wrote of these slots"
     for burst in sorted({b.burst for f in truth.frames for b in f.bursts} - truth.payload.keys()):
         yield f"payload must hold every burst that a frame shows (burst {burst} is missing)"
     for burst, row in truth.payload.items():
@@ -193,15 +202,39 @@ class Scorer:
     def __init__(self, truth: Truth) -> None:
         self._truth = truth
         self._bursts = {f.frame: tuple(b.burst for b in f.bursts) for f in truth.frames}
+        #: Of a transmission: one burst of each content; bursts that frames were found to show.
+        self._distinct = tuple({row: burst for burst, row in reversed(sorted(truth.payload.items()))}.values())
+        self._located: set[int] = set()
         self._fewest: dict[tuple[int, int], int] = {}
         self._false = 0
         self._wrong_w = 0
 
     def add(self, result: FrameResult) -> FrameResult:
         """Take the next frame into account; returns it with `bit_errors` filled in."""
-        candidates = self._bursts.get(result.frame - 1, ()) + self._bursts.get(result.frame, ())
+        if not self._truth.frames:
+            candidates = self._shown(result)
+            self._located.update(candidates)
+        else:
+            candidates = self._bursts.get(result.frame - 1, ()) + self._bursts.get(result.frame, ())
         columns = tuple(self._add_column(column, candidates) for column in result.columns)
         return replace(result, columns=columns)
+
+    def _shown(self, result: FrameResult) -> tuple[int, ...]:
+        """Bursts of a transmission with which the packets of a frame agree, all columns together."""
+        agreement = dict.fromkeys(self._distinct, 0.0)
+        for column in result.columns:
+            for packet in column.packets:
+                for burst in self._distinct if column.column < self._truth.columns else ():
+                    errors, n_bits = self._errors(packet, column.column, burst)
+                    agreement[burst] += max(MAX_WRONG_SHARE * n_bits - errors, 0.0)
+        enough = max(max(agreement.values(), default=0.0) * _ALSO_SHOWN, 1e-9)
+        return tuple(burst for burst, bits in agreement.items() if bits >= enough)
+
+    def _errors(self, packet: PacketResult, column: int, burst: int) -> tuple[int, int]:
+        """Wrong bits of a packet if it is that of a burst, and the bits of the longer of both."""
+        sent, n_sent = self._truth.payload[burst][column], self._truth.payload_bits[column]
+        errors = wrong_bits(packet.payload, packet.payload_bits, sent, n_sent)
+        return errors, max(n_sent, packet.payload_bits)
 
     def _add_column(self, column: ColumnResult, bursts: tuple[int, ...]) -> ColumnResult:
         sent_w = dict(enumerate(self._truth.w)).get(column.column)
@@ -213,35 +246,40 @@ class Scorer:
         if not bursts:
             self._false += 1
             return replace(packet, bit_errors=None)
-        sent, n_sent = self._truth.payload, self._truth.payload_bits[column]
-        found = ((wrong_bits(packet.payload, packet.payload_bits, sent[b][column], n_sent), b) for b in bursts)
-        errors, burst = min(found, key=lambda pair: pair[0])
-        if errors > MAX_WRONG_SHARE * max(n_sent, packet.payload_bits):
+        found = {burst: self._errors(packet, column, burst) for burst in bursts}
+        errors, n_bits = min(found.values())
+        if errors > MAX_WRONG_SHARE * n_bits:
             self._false += 1
-        else:
-            self._fewest[burst, column] = min(self._fewest.get((burst, column), errors), errors)
+        for burst, (wrong, _) in found.items():
+            if wrong == errors <= MAX_WRONG_SHARE * n_bits:
+                self._fewest[burst, column] = min(self._fewest.get((burst, column), errors), errors)
         return replace(packet, bit_errors=errors)
+
+    def _expected(self) -> dict[tuple[int, int], int]:
+        """Bits of every packet that should have been received, by burst and column."""
+        bursts: Iterable[int] = self._truth.expected_bursts
+        if not self._truth.frames:
+            bursts = self._located or self._distinct[:1]
+        bits = enumerate(self._truth.payload_bits)
+        return {(burst, column): n for column, n in bits if n for burst in sorted(bursts)}
 
     def faults(self) -> list[Fault]:
         """Expected packets of the frames so far that were lost or have wrong bits."""
-        expected = ((c, b) for c in range(self._truth.columns) for b in sorted(self._truth.expected_bursts))
-        found = (Fault(column, burst, self._fewest.get((burst, column))) for column, burst in expected)
+        found = (Fault(column, burst, self._fewest.get((burst, column))) for burst, column in self._expected())
         return [fault for fault in found if fault.wrong_bits != 0]
 
     def score(self) -> Score:
         """The score over the frames so far."""
-        truth, expected = self._truth, self._truth.expected_bursts
-        received = {key: errors for key, errors in self._fewest.items() if key[0] in expected}
-        extra = [errors for key, errors in self._fewest.items() if key[0] not in expected]
-        received_bits = sum(truth.payload_bits[column] for _, column in received)
-        bits = len(expected) * sum(truth.payload_bits)
+        expected = self._expected()
+        received = {key: errors for key, errors in self._fewest.items() if key in expected}
+        extra = [errors for key, errors in self._fewest.items() if key not in expected]
         return Score(
-            expected=len(expected) * truth.columns,
-            bits=bits,
+            expected=len(expected),
+            bits=sum(expected.values()),
             error_free=sum(errors == 0 for errors in received.values()),
             bit_errors=sum(received.values()),
-            lost=len(expected) * truth.columns - len(received),
-            lost_bits=bits - received_bits,
+            lost=len(expected) - len(received),
+            lost_bits=sum(bits for key, bits in expected.items() if key not in received),
             false=self._false,
             extra=len(extra),
             extra_error_free=sum(errors == 0 for errors in extra),

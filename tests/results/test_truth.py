@@ -161,3 +161,38 @@ def test_truth_beside_a_capture(tmp_path: Path) -> None:
     assert load_truth(path).payload[2][1] == "f0f0f0f0f0"
     with pytest.raises(InputError, match="No such file"):
         load_truth(tmp_path / "none.truth.json")
+
+
+def test_a_packet_that_several_bursts_send_is_received_in_all_of_them() -> None:
+    """Beacons and test patterns: the burst that the frame shows best need not be the first."""
+    same = RAW["payload"]["0"]
+    scorer = Scorer(truth(payload={"0": same, "1": same, "2": same}))
+    scorer.add(frame(1, ALL[0]))
+    found = scorer.score()
+    assert (found.error_free, found.lost, found.false, found.ber) == (4, 0, 0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("packets", "expected"),
+    [
+        ([(0, "aaaaaaaaaa"), (1, flip("5555555555", 2))], Score(2, 80, error_free=1, bit_errors=2)),
+        ([(0, "0f0f0f0f0f"), (1, "5555555555")], Score(4, 160, error_free=2, lost=2, lost_bits=80)),
+        ([(1, "5555555555")], Score(2, 80, error_free=1, lost=1, lost_bits=40)),
+        ([(0, "aaaaaaaaaa"), (1, "f0f0f0f0f1")], Score(4, 160, 1, 1, 2, 80)),
+        ([(0, "3333333333")], Score(2, 80, lost=2, lost_bits=80, false=1)),
+        ([], Score(2, 80, lost=2, lost_bits=80)),
+    ],
+    ids=["one burst", "two bursts", "one column", "two bursts, wrong bit", "false", "nothing"],
+)
+def test_the_packets_of_a_frame_find_its_bursts_in_a_transmission(
+    packets: list[tuple[int, str]], expected: Score
+) -> None:
+    scorer = Scorer(truth(frames=[]))
+    scorer.add(frame(0, packets))
+    assert scorer.score() == expected
+
+
+def test_dark_columns_of_a_transmission_are_not_expected() -> None:
+    scorer = Scorer(truth(frames=[], payload_bits=[N_BITS, 0], payload={"0": ["0000000000", ""]}))
+    scorer.add(frame(3, [(0, "0000000000")]))
+    assert scorer.score() == Score(1, N_BITS, error_free=1)
