@@ -50,11 +50,11 @@ JUNIT = re.compile(rb'<testsuite name="vlc-rx ')
 CAMERA = re.compile(rb'^kind = "camera"', re.MULTILINE)
 ESTIMATED_CAMERA = re.compile(rb'^description = "[^"\n]*estimated', re.MULTILINE)
 # Of `vlc-rx simulate`: truth, camera, transmitter.
-TRUTH = re.compile(rb'"written_by": "vlc-rx simulate"')
+TRUTH = re.compile(rb'"written_by": "vlc-rx (simulate|encode)"')
 SIMULATED_CAMERA = re.compile(rb'^description = "written by vlc-rx simulate"', re.MULTILINE)
 #: Labels or slots of `vlc-rx encode`, and the line that states their order.
 ENCODED = re.compile(rb"\A\x93NUMPY|\Aburst,symbol,column_0|one row a slot at")
-WAVEFORMS = re.compile(rb"\Acolumn_0|\A\x93NUMPY")
+WAVEFORMS = re.compile(rb"\Acolumn_0|one row a slot at")
 #: Arrays of the stages (`rxcli.results.dump`).
 TAPS = re.compile(
     rb"\APK\x03\x04.{26}(geometry|sampling|clock|samples|channel|detect|bursts)[a-z0-9._]*\.npy", re.DOTALL

@@ -1,4 +1,4 @@
-"""`vlc-rx encode`: what a transmitter has to send so that a text or a file comes out."""
+"""`vlc-rx encode`: what a transmitter has to send so that a text, a file or raw payload comes out."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from math import ceil
+from operator import mul
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.cli.common import claim_outputs, force_argument, options, refuse
-from rxcli.cli.sending import sending_of
+from rxcli.cli.kinds import FILE
+from rxcli.cli.sending import LIGHT, raw_sending, sending_of
 from rxcli.errors import InputError, UsageError
-from rxcli.link.encoder import FileSending, Sending, packet_slots_of, visible_bits_of_burst
-from rxcli.outputs import ENCODED, Output
+from rxcli.link.encoder import FileSending, Sending, TestLight, packet_slots_of, payload_hex, visible_bits_of_burst
+from rxcli.link.slots import WITHOUT_TEXT, WRITERS, bytes_per_row, order_of, write_slots
+from rxcli.outputs import ENCODED, TRUTH, Output, write_whole
 from rxcli.profiles import ScreenProfile, load_profile
+from rxcli.protocol import SLOTS_PER_SYMBOL, payload_bits
 from rxcli.results.report import plural
 
 _RATES = {"1/1.5": 0, "1/2": 1, "1/3": 2}
@@ -26,6 +30,7 @@ _RATES = {"1/1.5": 0, "1/2": 1, "1/3": 2}
 _CHUNK = 256
 #: Share of the time that a usual 4K video shows: what a time needed is reckoned with.
 _USUAL_READOUT = 0.61
+_OUT_HELP = "Where to write: .npy or .csv; slots also as .bin, .h or .vcd; - for stdout, as .csv."
 
 
 @click.command()
@@ -33,47 +38,91 @@ _USUAL_READOUT = 0.61
 @options(
     ("--text", str, None, "Send this text; one of more than 199 bytes goes as a file."),
     ("--uri", str, None, "Send this URI, of at most 199 bytes."),
+    ("--payload", str, None, "Send raw payload: random, counter, hex:..., or a file; or no packets: lit, half."),
+    ("--same", None, False, "Of --payload: all columns send the same."),
+    ("--only-column=N only_column", click.IntRange(0), None, "Let one column alone send; the others stay dark."),
+    ("--seed", click.IntRange(0), 0, "Of random payload."),
     ("--screen", str, "data-34k6", "Screen profile: a name or a TOML file."),
-    ("--out", click.Path(dir_okay=False, path_type=Path), None, "Where to write: .npy, or .csv.", {"required": True}),
+    ("--out", click.Path(dir_okay=False, path_type=Path), None, _OUT_HELP, {"required": True}),
     ("--bursts", click.IntRange(1), None, "How many bursts. [default: what a receiver needs, and more]"),
     ("--seconds", click.FloatRange(0, min_open=True), None, "How much time of the link, instead."),
-    ("--slots", None, False, "Write the slots themselves, bit-packed (.npy), instead of labels."),
+    ("--slots", None, False, "Write the slots themselves instead of labels; so do --payload, .bin, .h and .vcd."),
+    ("--truth", FILE, None, "Also write what is sent (JSON), for decode --truth."),
     ("--weights", str, "5", "Lit slots of ten: N, a list N,N,..., or a JSON file per burst."),
     ("--mother", tuple(_RATES), "1/3", "Mother rate of a file's code."),
     ("--object-id", click.IntRange(0, 65533), None, "Number of a file. [default: from its content]"),
 )
 @force_argument
 def encode(path: Path | None, out: Path, **options: Any) -> None:
-    """Encode the file PATH, a text or a URI as labels, or slots, for a transmitter."""
-    screen = load_profile(options["screen"], ScreenProfile)
-    is_ambiguous, suffix = options["bursts"] is not None and options["seconds"] is not None, out.suffix
+    """Encode the file PATH, a text, a URI or raw payload as labels, or slots, for a transmitter."""
+    screen, payload, only = load_profile(options["screen"], ScreenProfile), options["payload"], options["only_column"]
+    is_stream = str(out) == "-"
+    suffix = ".csv" if is_stream else out.suffix
+    has_slots = options["slots"] or payload is not None or suffix not in (".npy", ".csv")
+    is_ambiguous = options["bursts"] is not None and options["seconds"] is not None
+    known, n = ", ".join(WRITERS), screen.columns
     refuse(
         (is_ambiguous, "--bursts and --seconds exclude each other", "give one of them"),
-        (suffix not in (".npy", ".csv"), f"--out must end in .npy or .csv (got {str(out)!r})", "name such a file"),
-        (options["slots"] and suffix != ".npy", "--slots are written as .npy only", "name such a file"),
+        (suffix not in WRITERS, f"--out must end in {known}, or be - (got {str(out)!r})", "name such a file"),
+        (options["same"] and payload is None, "--same belongs to --payload", "add --payload random, or leave it out"),
+        (only is not None and not has_slots, "--only-column needs slots", "add --slots"),
+        (only is not None and only >= n, f"--only-column {only}: {screen.name} has {n} columns", "count from 0"),
+        (options["truth"] and payload in LIGHT, f"--payload {payload} sends no packets", "leave out --truth"),
     )
-    inputs = [path, Path(options["weights"]) if options["weights"].endswith(".json") else None]
-    readme = Output("--slots", _readme_of(out), ENCODED) if options["slots"] else None
-    written = [Output("--out", out, ENCODED), readme]
-    claim_outputs(written, filter(None, inputs), (options["screen"],), options["force"])
-    sending = sending_of(path, options["text"], options["uri"], _RATES[options["mother"]], options["object_id"])
-    n_bursts = _n_bursts(options, sending, screen)
-    plan = _Plan(sending, screen, _weights(options["weights"], n_bursts, screen.columns), n_bursts, out)
+    files = [path, *(Path(name) for name in (options["weights"], payload) if name and Path(name).is_file())]
+    readme = Output("--slots", _readme_of(out), ENCODED) if has_slots and suffix in WITHOUT_TEXT else None
+    written = [None if is_stream else Output("--out", out, ENCODED), readme]
+    written += [Output("--truth", options["truth"], TRUTH)] if options["truth"] else []
+    claim_outputs(written, filter(None, files), (options["screen"],), options["force"])
+    plan = _plan(path, screen, options)
     for row in plan.weights:
-        sending.check(row, screen.payload_symbols)
-    write = plan.write_csv if suffix == ".csv" else plan.write_slots if options["slots"] else plan.write_labels
+        plan.sending.check(row, screen.payload_symbols)
     try:
-        write()
+        if has_slots:
+            _write_slots(plan, out, suffix)
+        else:
+            plan.write_csv(out) if suffix == ".csv" else plan.write_labels(out)
+        if options["truth"]:
+            write_whole(options["truth"], json.dumps(plan.truth(), indent=1) + "\n")
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror or error})", "name another file") from None
-    click.echo(plan.summary(), err=True)
+    click.echo(f"{out}: {plan.summary()}", err=True)
+
+
+def _plan(path: Path | None, screen: ScreenProfile, options: dict[str, Any]) -> _Plan:
+    given = (path, options["text"], options["uri"])
+    sending: Sending | TestLight
+    if options["payload"] is None:
+        sending = sending_of(*given, _RATES[options["mother"]], options["object_id"])
+        n_bursts = _n_bursts(options, sending, screen)
+        weights = _weights(options["weights"], n_bursts, screen.columns)
+    else:
+        if any(value is not None for value in given):
+            raise UsageError("--payload excludes PATH, --text and --uri", "give one of them")
+        weights = _weights(options["weights"], 1, screen.columns)
+        sending = raw_sending(options["payload"], weights[0], options["seed"], options["same"])
+        n_bursts = _n_bursts(options, sending, screen)
+    return _Plan(sending, screen, weights, n_bursts, options["only_column"])
+
+
+def _write_slots(plan: _Plan, out: Path, suffix: str) -> None:
+    """Write slots in the format of a suffix; beside those without text a file that states rate and order."""
+    screen, n_slots = plan.screen, plan.n_bursts * plan.burst_slots
+    with click.open_file(str(out), "wb") as file:
+        write_slots(file, suffix, plan.slots(), n_slots, screen)
+    if suffix in WITHOUT_TEXT:
+        about = (
+            f"{out.name}: uint8 ({n_slots}, {bytes_per_row(screen)}); {order_of(screen)}; column 0 is the most "
+            "significant bit of the first byte.\n"
+        )
+        _readme_of(out).write_text(about, encoding="utf-8")
 
 
 def _readme_of(out: Path) -> Path:
     return out.with_name(out.name + ".README.txt")
 
 
-def _n_bursts(options: dict[str, Any], sending: Sending, screen: ScreenProfile) -> int:
+def _n_bursts(options: dict[str, Any], sending: Sending | TestLight, screen: ScreenProfile) -> int:
     burst_s = screen.packet_s * screen.repeats
     if options["bursts"] is not None:
         return int(options["bursts"])
@@ -111,62 +160,90 @@ def _weight_values(text: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """What is sent, and the file that it is written to."""
+    """What is sent."""
 
-    sending: Sending
+    sending: Sending | TestLight
     screen: ScreenProfile
     #: (n_bursts or 1, columns) lit slots of ten.
     weights: NDArray[np.int64]
     n_bursts: int
-    out: Path
+    #: The only column that sends; None for all.
+    only_column: int | None
+
+    @property
+    def burst_slots(self) -> int:
+        return self.screen.packet_slots * self.screen.repeats
 
     def _chunks(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """First burst and labels (bursts, symbols, columns) of some bursts at a time."""
+        assert not isinstance(self.sending, TestLight)
         for start in range(0, self.n_bursts, _CHUNK):
             bursts = np.arange(start, min(start + _CHUNK, self.n_bursts))
             yield start, self.sending.labels(bursts, self.screen.columns, self.screen.payload_symbols)
 
-    def write_labels(self) -> None:
+    def _weights_of(self, start: int, n: int) -> NDArray[np.int64]:
+        return self.weights if len(self.weights) == 1 else self.weights[start : start + n]
+
+    def write_labels(self, out: Path) -> None:
         """Write labels as an array."""
         shape = (self.n_bursts, self.screen.payload_symbols, self.screen.columns)
-        target = np.lib.format.open_memmap(self.out, "w+", np.uint8, shape)
+        target = np.lib.format.open_memmap(out, "w+", np.uint8, shape)
         for start, labels in self._chunks():
             target[start : start + len(labels)] = labels
         target.flush()
 
-    def write_csv(self) -> None:
+    def write_csv(self, out: Path) -> None:
         """Write labels as text, one row a symbol."""
-        with self.out.open("w", encoding="utf-8") as file:
+        with click.open_file(str(out), "w", encoding="utf-8") as file:
             file.write("burst,symbol," + ",".join(f"column_{c}" for c in range(self.screen.columns)) + "\n")
             for start, labels in self._chunks():
                 for burst, symbols in enumerate(labels, start):
                     for symbol, row in enumerate(symbols):
                         file.write(f"{burst},{symbol},{','.join(map(str, row))}\n")
 
-    def write_slots(self) -> None:
-        """Write slots as an array of bits, and beside it a text file that states their order."""
-        screen, out = self.screen, self.out
-        burst_slots, width = screen.packet_slots * screen.repeats, -(-screen.columns // 8)
-        target = np.lib.format.open_memmap(out, "w+", np.uint8, (self.n_bursts * burst_slots, width))
+    def slots(self) -> Iterator[NDArray[np.uint8]]:
+        """(slots, columns) 0/1 of some bursts at a time."""
+        dark = np.arange(self.screen.columns) != self.only_column
+        for slots in self._slots_of_all():
+            if self.only_column is not None:
+                slots[:, dark] = 0
+            yield slots
+
+    def _slots_of_all(self) -> Iterator[NDArray[np.uint8]]:
+        columns, repeats = self.screen.columns, self.screen.repeats
+        if isinstance(self.sending, TestLight):
+            lit = np.arange(self.n_bursts * self.burst_slots) % SLOTS_PER_SYMBOL < self.sending.n_lit
+            yield np.repeat(lit[:, None], columns, axis=1).astype(np.uint8)
+            return
         for start, labels in self._chunks():
-            weights = self.weights if len(self.weights) == 1 else self.weights[start : start + len(labels)]
-            packets = np.packbits(packet_slots_of(labels, weights).transpose(0, 2, 1), axis=2)
-            repeated = np.tile(packets, (1, screen.repeats, 1)).reshape(-1, width)
-            target[start * burst_slots : start * burst_slots + len(repeated)] = repeated
-        target.flush()
-        _readme_of(out).write_text(
-            f"{out.name}: uint8 ({len(target)}, {width}); one row a slot at {screen.slot_rate_hz:g} Hz, first sent "
-            f"first; {screen.columns} columns as bits, column 0 (the viewer's leftmost) is the most significant bit of "
-            "the first byte; 1 is lit.\n",
-            encoding="utf-8",
-        )
+            packets = packet_slots_of(labels, self._weights_of(start, len(labels))).transpose(0, 2, 1)
+            yield np.tile(packets, (1, repeats, 1)).reshape(-1, columns)
+
+    def truth(self) -> dict[str, Any]:
+        """What is sent, as `decode --truth` reads it: bursts without frames."""
+        screen, sends = self.screen, [self.only_column in (None, column) for column in range(self.screen.columns)]
+        refuse((len(self.weights) > 1, "--truth needs one weight per column, for all bursts", "give --weights N"))
+        rows = (row for _, labels in self._chunks() for row in payload_hex(labels, self.weights))
+        bits = [payload_bits(int(w), screen.payload_symbols) for w in self.weights[0]]
+        return {
+            "screen": screen.name,
+            **{name: getattr(screen, name) for name in ("columns", "slot_rate_hz", "payload_symbols", "repeats")},
+            "w": self.weights[0].tolist(),
+            "payload_bits": [*map(mul, bits, sends)],
+            "frames": [],
+            "payload": {
+                burst: [text * is_lit for text, is_lit in zip(row, sends, strict=True)]
+                for burst, row in enumerate(rows)
+            },
+            "written_by": "vlc-rx encode",
+        }
 
     def summary(self) -> str:
         """What is sent, and how long a camera needs for a file."""
         screen, weights = self.screen, self.weights
         burst_s = screen.packet_s * screen.repeats
         sent = f"{plural(self.n_bursts, 'burst')} of {screen.name}, {self.n_bursts * burst_s:.3g} s"
-        lines = [f"{self.out}: {self.sending.summary}; {sent}"]
+        lines = [f"{self.sending.summary}; {sent}"]
         if isinstance(self.sending, FileSending):
             bits = sum(visible_bits_of_burst(row, screen.payload_symbols) for row in weights) / len(weights)
             needed = self.sending.ready_bits / (bits * 31 / 32) * burst_s / _USUAL_READOUT

@@ -1,16 +1,21 @@
-"""What `encode` and `simulate` send: a text, a URI or a file."""
+"""What `encode` and `simulate` send: a text, a URI, a file, or raw payload."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rxcli.errors import InputError, UsageError
-from rxcli.link.encoder import FileSending, MessageSending, file_object, message
+from rxcli.link.encoder import FileSending, MessageSending, RawSending, TestLight, file_object, message
 from rxcli.link.formats import MAX_MESSAGE_BYTES
 
 #: Name under which a text goes that is too long for a message.
 _TEXT_NAME = "message.txt"
 _MAX_FILE_BYTES = 1 << 30
+#: Lit slots of ten of payloads without packets.
+LIGHT = {"lit": 10, "half": 5}
 
 
 def sending_of(
@@ -37,6 +42,39 @@ def sending_of(
     if len(data) > MAX_MESSAGE_BYTES:
         return file_object(_TEXT_NAME, data, object_id, mother)
     return message(data)
+
+
+def raw_sending(text: str, weights: NDArray[np.int64], seed: int, same: bool) -> RawSending | TestLight:
+    """What --payload names: a test light, random bits, a counter, hex digits, or a file.
+
+    Raises:
+        UsageError: it is no hex, empty, or no file.
+    """
+    if text in LIGHT:
+        return TestLight(LIGHT[text])
+    if text == "counter":
+        return RawSending(None, weights, None)
+    return RawSending(payload_bytes(text), weights, seed, same)
+
+
+def payload_bytes(text: str) -> bytes | None:
+    """The bytes of hex digits or of a file, or None for "random".
+
+    Raises:
+        UsageError: it is no hex, empty, or no file.
+    """
+    if text == "random":
+        return None
+    try:
+        data = bytes.fromhex(text[4:]) if text.startswith("hex:") else Path(text).read_bytes()
+    except ValueError:
+        raise UsageError(f"--payload: {text!r} holds no hex", "give an even number of hex digits") from None
+    except OSError as error:
+        reason = f"--payload: {text}: cannot be read ({error.strerror})"
+        raise UsageError(reason, "give 'random', 'hex:...' or a file") from None
+    if not data:
+        raise UsageError(f"--payload: {text!r} is empty", "give at least one byte")
+    return data
 
 
 def _bytes_of(path: Path) -> bytes:

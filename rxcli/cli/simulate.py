@@ -11,26 +11,30 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
 from rxcli import outputs
 from rxcli.cli.common import claim_outputs, force_argument, options
 from rxcli.cli.kinds import FILE, FOLDER, Exposure
-from rxcli.cli.sending import sending_of
+from rxcli.cli.sending import payload_bytes, sending_of
 from rxcli.errors import UsageError
 from rxcli.lab.simulate.capture import Recording, prepare, write_capture
 from rxcli.lab.simulate.files import CODECS
 from rxcli.lab.simulate.pictures import picture_names
 from rxcli.lab.simulate.scenes import PRESETS, Scene, preset, with_fields
-from rxcli.lab.simulate.transmitter import WAVEFORM_FILES, Weights, export_waveforms
+from rxcli.lab.simulate.transmitter import PICTURE_FILES, Waveform, Weights, export_picture
 from rxcli.lab.simulate.truth import build_camera_profile, truth_path, write_truth
 from rxcli.link.encoder import Sending
-from rxcli.profiles import dump_profile
+from rxcli.link.slots import read_slots, write_slots
+from rxcli.profiles import ScreenProfile, dump_profile
 
 _STILLS = ("jpeg", "dng", "dng14", "png", "png16", "tiff", "tiff16")
 _FORMATS = (*_STILLS, *CODECS)
 _SUFFIXES = {".jpg": "jpeg", ".jpeg": "jpeg", ".dng": "dng", ".png": "png", ".tif": "tiff", ".tiff": "tiff"}
 _VIDEO_SUFFIXES = {".mp4": "h264", ".mov": "h264", ".mkv": "h264", ".avi": "mjpeg"}
 
+#: Slots among the files of --waveforms.
+_SLOT_FILE = "slots.csv"
 #: Options that are fields of the scene by the same name.
 _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm", "hand_px")
 
@@ -45,6 +49,7 @@ _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_ra
     ("--text", str, None, "Send this text (a longer one as a file), for the link layer to receive."),
     ("--uri", str, None, "Send this URI."),
     ("--file file_path", click.Path(path_type=Path), None, "Send this file."),
+    ("--slots", FILE, None, "Send the slots that encode wrote to this file (.csv, .npy, .bin), over and over."),
     ("--seed", click.IntRange(0), 0, "Same seed, same pixels."),
     ("--format=NAME file_format", _FORMATS, None, f"Format of OUT, {', '.join(_FORMATS)}. [default: by its suffix]"),
     ("--w weights", str, "5", "Lit slots of ten: N, a list N,N,..., or 'dimming'."),
@@ -103,9 +108,10 @@ def _claim(out: Path, options: dict[str, Any]) -> None:
         found.append(outputs.Output("--camera-profile", options["camera_profile"], outputs.SIMULATED_CAMERA))
     if options["waveforms"] is not None:
         outputs.claim_folder("--waveforms", options["waveforms"])
-        patterns = {name: outputs.PICTURE if name.endswith(".png") else outputs.WAVEFORMS for name in WAVEFORM_FILES}
+        names = (_SLOT_FILE, *PICTURE_FILES)
+        patterns = {name: outputs.PICTURE if name.endswith(".png") else outputs.WAVEFORMS for name in names}
         found += [outputs.Output("--waveforms", options["waveforms"] / name, ours) for name, ours in patterns.items()]
-    inputs = [options["picture"], options["payload"], *([options["file_path"]] if options["file_path"] else [])]
+    inputs = [options["picture"], options["payload"], *filter(None, (options["file_path"], options["slots"]))]
     claim_outputs(found, inputs, (options["screen"],), options["force"])
 
 
@@ -128,7 +134,9 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
     scene = preset(options["preset"], options["screen"])
     for text in options["fields"]:
         scene = with_fields(scene, _table(text))
-    sent: dict[str, Any] = {"payload": _payload(options["payload"]), "labels": _labels(options)}
+    sent: dict[str, Any] = {"payload": payload_bytes(options["payload"]), "labels": _labels(options)}
+    if options["slots"] is not None:
+        sent["waveform"] = _waveform(options, scene.screen)
     scene = replace(scene, w=_weights(options["weights"]), **sent, **_given(options, _SCENE_OPTIONS))
     scene = _with_pose(scene, options)
     if options["exposure_s"] is not None:
@@ -141,6 +149,14 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
     if options["scale"] is not None:
         scene = scene.scaled(options["scale"], keep_readout=options["keep_readout"])
     return _for_format(scene, file_format)
+
+
+def _waveform(options: dict[str, Any], screen: ScreenProfile) -> Waveform:
+    """The light that a file of slots drives."""
+    if options["payload"] != "random" or _given(options, ("text", "uri", "file_path")):
+        raise UsageError("--slots excludes --payload, --text, --uri and --file", "give one of them")
+    slots = read_slots(options["slots"], screen).T.astype(np.float64)
+    return lambda slot: slots[:, slot.astype(np.int64) % slots.shape[1]]
 
 
 def _table(text: str) -> dict[str, Any]:
@@ -224,21 +240,6 @@ def _warn_of_cut_packets(capture: Recording) -> None:
         click.echo(f"vlc-rx: no packet fits a frame: {reason}; only clips put packets together", err=True)
 
 
-def _payload(text: str) -> bytes | None:
-    if text == "random":
-        return None
-    try:
-        data = bytes.fromhex(text[4:]) if text.startswith("hex:") else Path(text).read_bytes()
-    except ValueError:
-        raise UsageError(f"--payload: {text!r} holds no hex", "give an even number of hex digits") from None
-    except OSError as error:
-        reason = f"--payload: {text}: cannot be read ({error.strerror})"
-        raise UsageError(reason, "give 'random', 'hex:...' or a file") from None
-    if not data:
-        raise UsageError(f"--payload: {text!r} is empty", "give at least one byte")
-    return data
-
-
 def _write(capture: Recording, out: Path, file_format: str, bit_rate: int | None) -> Path:
     """Write the capture and its truth; returns the truth's path."""
     from tqdm import tqdm
@@ -246,7 +247,9 @@ def _write(capture: Recording, out: Path, file_format: str, bit_rate: int | None
     progress = partial(tqdm, desc=out.name, unit="frame", leave=False, disable=None)
     with outputs.replacing(out) as hidden:
         write_capture(capture, hidden, file_format, bit_rate, progress)
-    return write_truth(capture.truth(out.name), out)
+    # The payload of a file of slots is in the truth that `encode` wrote.
+    unknown: dict[str, Any] = {"payload": {}} if capture.scene.waveform is not None else {}
+    return write_truth(capture.truth(out.name) | unknown, out)
 
 
 def _write_extras(capture: Recording, options: dict[str, Any]) -> None:
@@ -256,7 +259,11 @@ def _write_extras(capture: Recording, options: dict[str, Any]) -> None:
         outputs.write_whole(options["camera_profile"], dump_profile(build_camera_profile(capture.scene, last)))
     if options["waveforms"] is not None:
         n_bursts = 1 + int(last.row_start_slots[-1] // capture.link.burst_slots)
-        export_waveforms(capture.drive, capture.link, n_bursts, options["waveforms"])
+        n_slots, folder = n_bursts * capture.link.burst_slots, options["waveforms"]
+        folder.mkdir(parents=True, exist_ok=True)
+        with (folder / _SLOT_FILE).open("wb") as file:
+            write_slots(file, ".csv", [capture.link.slots(0, n_slots).T], n_slots, capture.scene.screen)
+        export_picture(capture.drive, folder)
 
 
 def _summary(capture: Recording) -> str:

@@ -21,7 +21,7 @@ from rxcli.link.layout import (
     announcement_layout,
     beacon_layout,
 )
-from rxcli.protocol import HEADER, bits_per_symbol, codebook, dimming_symbol
+from rxcli.protocol import HEADER, bits_per_symbol, bits_to_hex, codebook, dimming_symbol
 from rxcli.types import MessageKind
 
 #: Information at which one photo suffices for a beacon, relative to its bits.
@@ -29,6 +29,8 @@ BEACON_NEED = 1.2
 _LABEL_WEIGHTS = 1 << np.arange(LABEL_BITS - 1, -1, -1)
 #: Blocks per encoding batch.
 _BATCH = 64
+#: Bursts of random payload or of a counter, unless more are asked for.
+_RAW_BURSTS = 64
 
 Labels = NDArray[np.uint8]
 
@@ -186,8 +188,81 @@ class FileSending:
         )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RawSending:
+    """Raw payload, as the paper sends it: burst by burst, within it column by column, over and over."""
+
+    #: What is sent; None for random bits, or for a counter.
+    content: bytes | None
+    #: (C,) lit slots of ten.
+    weights: NDArray[np.int64]
+    #: Seed of random bits; None: the number of the burst in 16 bits, over and over, in every column.
+    seed: int | None = 0
+    #: Whether all columns send the same.
+    same: bool = False
+
+    def labels(self, bursts: Places, columns: int, payload_symbols: int) -> Labels:
+        """(n, N, C) uint8 labels of bursts `bursts` (n,)."""
+        out = np.empty((len(bursts), payload_symbols, columns), np.uint8)
+        for place, burst in enumerate(bursts.tolist()):
+            for column, bits in enumerate(self._payload(burst, payload_symbols)):
+                symbols = np.zeros((payload_symbols, LABEL_BITS), np.uint8)
+                symbols[:, : bits.size // payload_symbols] = bits.reshape(payload_symbols, -1)
+                out[place, :, column] = symbols @ _LABEL_WEIGHTS
+        return out
+
+    def _payload(self, burst: int, payload_symbols: int) -> list[NDArray[np.uint8]]:
+        """Payload bits of a burst, by column."""
+        sizes = [payload_symbols * bits_per_symbol(int(w)) for w in self.weights]
+        total = max(sizes) if self.same else sum(sizes)
+        if self.content is not None:
+            bits = np.take(_bits(self.content), np.arange(burst * total, (burst + 1) * total), mode="wrap")
+        elif self.seed is not None:
+            rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, burst])))
+            bits = rng.integers(0, 2, total, dtype=np.uint8)
+        else:
+            number = _bits((burst % (1 << 16)).to_bytes(2, "big"))
+            return [np.resize(number, size) for size in sizes]
+        return [bits[:size] for size in sizes] if self.same else np.split(bits, np.cumsum(sizes)[:-1])
+
+    def check(self, weights: NDArray[np.int64], payload_symbols: int) -> None:
+        """Raw payload may have any weights."""
+
+    def usual_bursts(self, columns: int, payload_symbols: int) -> int:
+        """Bursts after which the payload begins anew; of random bits and a counter some."""
+        if self.content is None:
+            return _RAW_BURSTS
+        sizes = [payload_symbols * bits_per_symbol(int(w)) for w in self.weights]
+        return -(-8 * len(self.content) // (max(sizes) if self.same else sum(sizes)))
+
+    @property
+    def summary(self) -> str:
+        """One line for people."""
+        kind = "a counter" if self.content is None and self.seed is None else "raw payload"
+        return f"{kind}, the same in all columns" if self.same or kind == "a counter" else kind
+
+
+@dataclass(frozen=True, slots=True)
+class TestLight:
+    """Light without packets: of every ten slots some lit ones, then dark ones."""
+
+    n_lit: int
+
+    def check(self, weights: NDArray[np.int64], payload_symbols: int) -> None:
+        """Light needs no bits."""
+
+    def usual_bursts(self, columns: int, payload_symbols: int) -> int:
+        """One: it is the same all the time."""
+        return 1
+
+    @property
+    def summary(self) -> str:
+        """One line for people."""
+        return f"light without packets, {self.n_lit} of ten slots lit"
+
+
 #: A continuous transmission.
-Sending = MessageSending | FileSending
+Sending = MessageSending | FileSending | RawSending
 
 
 def file_object(name: str, data: bytes, object_id: int | None = None, mother: int = 2) -> FileSending:
@@ -200,6 +275,16 @@ def file_object(name: str, data: bytes, object_id: int | None = None, mother: in
     if object_id is None:
         object_id = zlib.crc32(container) % 0xFFFE
     return FileSending(container, object_id, mother, name)
+
+
+def payload_hex(labels: Labels, weights: NDArray[np.int64]) -> list[list[str]]:
+    """Payload of every packet in hex, by burst and column, from labels (n, N, C) and weights (n or 1, C)."""
+    sent = np.unpackbits(np.left_shift(labels, 1, dtype=np.uint8)[..., None], axis=-1)
+    rows = np.broadcast_to(weights, (len(labels), weights.shape[-1]))
+    return [
+        [bits_to_hex(burst[:, column, : bits_per_symbol(int(w))].ravel()) for column, w in enumerate(row)]
+        for burst, row in zip(sent, rows, strict=True)
+    ]
 
 
 # -- slots -------------------------------------------------------------------------------------------------------------

@@ -62,7 +62,7 @@ class Truth(msgspec.Struct, frozen=True, kw_only=True):
     w: tuple[int, ...]
     #: Payload bits of one packet, per column.
     payload_bits: tuple[Annotated[int, Meta(ge=0, le=7000)], ...]
-    #: None are known of a transmission, any part of which may have been photographed.
+    #: Empty for a transmission: photographs may show any part of it.
     frames: tuple[TruthFrame, ...] = ()
     #: Burst number -> one hex string per column, first bit most significant.
     payload: dict[int, tuple[str, ...]]
@@ -203,7 +203,7 @@ class Scorer:
         self._truth = truth
         self._bursts = {f.frame: tuple(b.burst for b in f.bursts) for f in truth.frames}
         #: Of a transmission: one burst of each content; bursts that frames were found to show.
-        self._distinct = tuple({row: burst for burst, row in reversed(sorted(truth.payload.items()))}.values())
+        self._distinct = tuple({row: burst for burst, row in sorted(truth.payload.items(), reverse=True)}.values())
         self._located: set[int] = set()
         self._fewest: dict[tuple[int, int], int] = {}
         self._false = 0

@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import csv
 import json
+import re
+import shutil
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rxcli.cli.main import run
-from rxcli.errors import ExitCode
+from rxcli.errors import ExitCode, InputError, UsageError
+from rxcli.lab.simulate.transmitter import Link
 from rxcli.link.encoder import file_object, message, packet_slots_of
+from rxcli.link.slots import read_slots
+from rxcli.profiles import ScreenProfile, load_profile
+from rxcli.protocol import bits_to_hex, codebook
+from rxcli.results.truth import load_truth
 
 
 def encode(*arguments: object) -> int:
@@ -65,8 +75,17 @@ def test_slots_are_packed_in_the_order_that_the_line_beside_them_says(tmp_path: 
         (["--uri", "u" * 200], ExitCode.USAGE, "199 bytes"),
         (["missing.bin"], ExitCode.UNREADABLE, "missing.bin"),
         (["--text", "a", "--screen", "nothing"], ExitCode.USAGE, "data-34k6"),
-        (["--text", "a", "--force", "--out", "x.txt"], ExitCode.USAGE, "must end in .npy or .csv (got 'x.txt')"),
-        (["--text", "a", "--slots", "--out", "x.csv"], ExitCode.USAGE, "--slots are written as .npy only"),
+        (
+            ["--text", "a", "--force", "--out", "x.txt"],
+            ExitCode.USAGE,
+            "must end in .csv, .npy, .bin, .h, .vcd, or be - (got 'x.txt')",
+        ),
+        (["--text", "a", "--same"], ExitCode.USAGE, "--same belongs to --payload"),
+        (["--text", "a", "--payload", "random"], ExitCode.USAGE, "--payload excludes"),
+        (["--text", "a", "--only-column", "2"], ExitCode.USAGE, "--only-column needs slots"),
+        (["--payload", "random", "--only-column", "20"], ExitCode.USAGE, "data-34k6 has 20 columns"),
+        (["--payload", "lit", "--truth", "t.json"], ExitCode.USAGE, "sends no packets"),
+        (["--payload", "hex:a"], ExitCode.USAGE, "holds no hex"),
         (["--text", "a"], ExitCode.USAGE, "replace it with --force"),
     ],
 )
@@ -80,6 +99,124 @@ def test_what_cannot_work_is_refused(
     assert encode("--out", out, *arguments) == code
     assert words in capsys.readouterr().err
     assert (out.read_bytes() if out.exists() else None) == before
+
+
+SCREEN = """format = 1
+kind = "screen"
+name = "bench-12"
+columns = 12
+slot_rate_hz = 17300
+payload_symbols = 11
+repeats = 2
+"""
+
+
+def slots_of_c(text: str, tmp_path: Path) -> list[int]:
+    """Bytes of the array that a C compiler makes of a header."""
+    if not (compiler := shutil.which("cc") or shutil.which("gcc")):
+        pytest.skip("no C compiler here")
+    (tmp_path / "slots.h").write_text(text)
+    main = '#include <stdio.h>\n#include "slots.h"\nint main(void) { fwrite(vlc_slots, 1, sizeof vlc_slots, stdout); }'
+    (tmp_path / "main.c").write_text(main)
+    subprocess.run([compiler, "-Wall", "-Werror", "main.c", "-o", "dump"], cwd=tmp_path, check=True)
+    return list(subprocess.run([tmp_path / "dump"], capture_output=True, check=True).stdout)
+
+
+def slots_of_vcd(text: str, rate_hz: float) -> NDArray[np.uint8]:
+    """(n, C) states of a value change dump, sampled in the middle of every slot."""
+    names = re.findall(r"\$var wire 1 (\S+) column_\d+ \$end", text)
+    changes = [(int(time), body) for time, body in re.findall(r"^#(\d+)\n((?:[01]\S+\n)*)", text, re.MULTILINE)]
+    assert "$timescale 1 ns $end" in text
+    n_slots, state, rows = round(changes[-1][0] * rate_hz / 1e9), dict.fromkeys(names, "0"), []
+    for slot in range(n_slots):
+        while changes and changes[0][0] * rate_hz / 1e9 < slot + 0.5:
+            state |= {change[1:]: change[0] for change in changes.pop(0)[1].split()}
+        rows.append([int(state[name]) for name in names])
+    return np.array(rows, np.uint8)
+
+
+def test_every_format_of_slots_is_read_back_bit_for_bit(tmp_path: Path, capsysbinary: Any) -> None:
+    """By a reader of its kind: NumPy, C, a table, a value change dump."""
+    (tmp_path / "bench.toml").write_text(SCREEN)
+    how = ("--payload", "random", "--seed", 4, "--weights", 4, "--screen", tmp_path / "bench.toml", "--bursts", 3)
+    for suffix in (".csv", ".npy", ".bin", ".h", ".vcd"):
+        assert encode(*how, "--out", tmp_path / f"s{suffix}") == ExitCode.OK
+    assert encode(*how, "--out", "-") == ExitCode.OK
+    screen = load_profile(tmp_path / "bench.toml", ScreenProfile)
+    sent = Link(screen, np.full(12, 4), seed=4).slots(0, 3 * 2 * 130).T
+    text, packed = (tmp_path / "s.csv").read_text(), np.packbits(sent, axis=1)
+    assert capsysbinary.readouterr().out.decode() == text
+    assert text.startswith("# 780 slots; one row a slot at 17300 Hz, first sent first; 12 columns")
+    assert np.array_equal([row[::2] for row in text.splitlines()[2:]], ["".join(map(str, row)) for row in sent])
+    assert np.array_equal(np.load(tmp_path / "s.npy"), packed)
+    assert (tmp_path / "s.bin").read_bytes() == packed.tobytes()
+    assert "one row a slot at 17300 Hz" in (tmp_path / "s.bin.README.txt").read_text()
+    assert np.array_equal(slots_of_vcd((tmp_path / "s.vcd").read_text(), 17300), sent)
+    for name in ("s.csv", "s.npy", "s.bin"):
+        assert np.array_equal(read_slots(tmp_path / name, screen), sent)
+    assert slots_of_c((tmp_path / "s.h").read_text(), tmp_path) == packed.ravel().tolist()
+
+
+@pytest.mark.parametrize(("name", "content"), [("a.csv", "x"), ("a.npy", "x"), ("a.bin", "xx"), ("a.h", "x")])
+def test_what_is_no_file_of_slots_is_refused(tmp_path: Path, name: str, content: str) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises((UsageError, InputError), match=name):
+        read_slots(tmp_path / name, load_profile("data-17k3", ScreenProfile))
+
+
+@pytest.mark.parametrize("content", ["hex:cafe", "random"])
+def test_raw_payload_is_what_the_simulator_sends(tmp_path: Path, content: str) -> None:
+    """Two encoders, written apart; and what the truth says is in the slots."""
+    out, truth_file, weights = tmp_path / "s.bin", tmp_path / "t.json", [1 + c % 9 for c in range(20)]
+    how = ("--screen", "paper-8k65", "--weights", ",".join(map(str, weights)), "--bursts", 2)
+    assert encode("--payload", content, *how, "--out", out, "--truth", truth_file) == ExitCode.OK
+    screen = load_profile("paper-8k65", ScreenProfile)
+    link = Link(screen, np.array(weights), 0, bytes.fromhex(content[4:]) if content != "random" else None)
+    assert np.array_equal(read_slots(out, screen), link.slots(0, 2 * 3 * 70).T)
+    truth = load_truth(truth_file)
+    assert truth.payload == {b: tuple(bits_to_hex(bits) for bits in link.payload(b)) for b in range(2)}
+    assert truth.payload_bits == tuple(link.bits_per_column)
+
+
+@pytest.mark.parametrize(
+    ("what", "lit"),
+    [(("counter",), None), (("hex:cafe", "--same"), None), (("lit",), 10), (("half",), 5), (("random",), None)],
+    ids=lambda value: value[0] if isinstance(value, tuple) else "",
+)
+def test_first_light_is_the_same_in_all_columns_or_in_one(
+    tmp_path: Path, what: tuple[str, ...], lit: int | None
+) -> None:
+    out, screen = tmp_path / "s.bin", load_profile("data-17k3", ScreenProfile)
+    how = ("--screen", "data-17k3", "--bursts", 3, "--out", out)
+    assert encode("--payload", *what, *how) == ExitCode.OK
+    slots = read_slots(out, screen)
+    assert (slots == slots[:, :1]).all() == (what != ("random",))
+    if lit is not None:
+        assert np.array_equal(slots[:, 0], np.arange(3 * 130) % 10 < lit)
+    if what == ("counter",):
+        words = codebook(5).tolist()
+        packet = [words.index(word.tolist()) for word in slots[130:260, 0].reshape(13, 10)[2:]]
+        bits = "".join(f"{index:07b}" for index in packet)
+        assert bits == (f"{1:016b}" * 5)[:77]
+    assert encode("--payload", *what, *how, "--only-column", 7, "--force") == ExitCode.OK
+    alone = read_slots(out, screen)
+    assert np.array_equal(alone[:, 7], slots[:, 7])
+    assert not np.delete(alone, 7, axis=1).any()
+
+
+def test_slots_through_the_simulator_are_scored_against_the_truth_of_encode(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The way of docs/transmitter.md, from the payload to a scored photo."""
+    slots, truth, shot = tmp_path / "slots.csv", tmp_path / "sent.json", tmp_path / "photo.png"
+    assert encode("--payload", "random", "--screen", "paper-17k3", "--out", slots, "--truth", truth) == ExitCode.OK
+    how = ("--scale", "0.25", "--keep-readout", "--picture", "grey", "--screen", "paper-17k3", "--start-slot", "9000")
+    assert run(["simulate", str(shot), "--slots", str(slots), *how]) == ExitCode.OK
+    gate = ("--min-packets", "20", "--max-ber", "0.01")
+    assert run(["decode", str(shot), "--truth", str(truth), *gate]) == ExitCode.OK
+    capsys.readouterr()
+    assert run(["decode", str(shot), "--truth", "auto"]) == ExitCode.UNREADABLE
+    assert "encode --truth" in capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")

@@ -177,7 +177,7 @@ def test_command_writes_clips_through_real_encoders(tmp_path: Path, name: str, c
     assert formats == [(384, 216, bits)] * 3
     truth = json.loads((tmp_path / "a.truth.json").read_text())
     assert [frame["frame"] for frame in truth["frames"]] == [0, 1, 2]
-    assert (tmp_path / "lab" / "slots.npy").is_file()
+    assert (tmp_path / "lab" / "slots.csv").is_file()
 
 
 @pytest.mark.parametrize(

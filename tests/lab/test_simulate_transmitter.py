@@ -10,13 +10,13 @@ import pytest
 from rxcli.errors import UsageError
 from rxcli.lab.simulate.pictures import load_picture, picture_names
 from rxcli.lab.simulate.transmitter import (
-    WAVEFORM_FILES,
+    PICTURE_FILES,
     Link,
     backlight_average,
     choose_weights,
     dimming_levels,
     drive_screen,
-    export_waveforms,
+    export_picture,
     light_spread,
 )
 from rxcli.profiles import ScreenProfile, load_profile
@@ -112,19 +112,15 @@ def test_message_is_sent_burst_by_burst_and_column_by_column(screen: ScreenProfi
     np.testing.assert_array_equal(sent, wanted)
 
 
-def test_waveforms_for_a_real_backlight(screen: ScreenProfile, tmp_path: Path) -> None:
+def test_picture_for_a_real_backlight(screen: ScreenProfile, tmp_path: Path) -> None:
     import cv2
 
     drive = drive_screen(screen, load_picture("bars", 1366, 768), 5)
-    link = link_of(screen)
-    export_waveforms(drive, link, 1, tmp_path / "lab")
-    assert {path.name for path in (tmp_path / "lab").iterdir()} == set(WAVEFORM_FILES)
-    slots = np.load(tmp_path / "lab" / "slots.npy")
-    np.testing.assert_array_equal(slots.T, link.slots(0, link.burst_slots))
-    text = (tmp_path / "lab" / "slots.csv").read_text()
-    assert text.startswith("column_0,column_1,")
-    np.testing.assert_array_equal(np.loadtxt(text.splitlines()[1:], delimiter=","), slots)
-    picture = cv2.imread(str(tmp_path / "lab" / "picture.png"))[..., ::-1]
+    export_picture(drive, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == set(PICTURE_FILES)
+    levels = np.loadtxt(tmp_path / "levels.csv", delimiter=",", skiprows=1)
+    np.testing.assert_allclose(levels, drive.levels, atol=1e-6)
+    picture = cv2.imread(str(tmp_path / "picture.png"))[..., ::-1]
     np.testing.assert_array_equal(picture, drive.grey)
 
 

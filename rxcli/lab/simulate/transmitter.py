@@ -225,23 +225,19 @@ class Link:
         return np.concatenate([dark, sent[:, max(start, 0) - origin : max(stop, 0) - origin]], axis=1)
 
 
-#: What `export_waveforms` writes.
-WAVEFORM_FILES = ("slots.npy", "slots.csv", "levels.csv", "lit_light.csv", "picture.png")
+#: What `export_picture` writes.
+PICTURE_FILES = ("levels.csv", "lit_light.csv", "picture.png")
 
 
-def export_waveforms(drive: Drive, link: Link, n_bursts: int, folder: Path) -> None:
-    """Write what a laboratory needs to drive a real backlight.
+def export_picture(drive: Drive, folder: Path) -> None:
+    """Write what a laboratory needs beside the slots to drive a real screen.
 
-    `slots.npy` and `slots.csv` hold one line per slot and one value per column; `levels.csv` the average light of every
-    segment, `lit_light.csv` its light while lit (1 is the full average); `picture.png` the compensated picture.
+    `levels.csv` holds the average light of every segment, `lit_light.csv` its light while lit (1 is the full average);
+    `picture.png` is the compensated picture.
     """
     from rxcli.outputs import encode_png
 
-    folder.mkdir(parents=True, exist_ok=True)
-    slots = link.slots(0, n_bursts * link.burst_slots).T
-    names = ",".join(f"column_{c}" for c in range(slots.shape[1]))
-    np.save(folder / "slots.npy", slots)
-    np.savetxt(folder / "slots.csv", slots, fmt="%d", delimiter=",", header=names, comments="")
-    np.savetxt(folder / "levels.csv", drive.levels, fmt="%.6f", delimiter=",", header=names, comments="")
-    np.savetxt(folder / "lit_light.csv", drive.lit_light, fmt="%.6f", delimiter=",", header=names, comments="")
-    (folder / WAVEFORM_FILES[-1]).write_bytes(encode_png(np.ascontiguousarray(drive.grey[..., ::-1])))
+    names = ",".join(f"column_{c}" for c in range(drive.levels.shape[1]))
+    for name, light in zip(PICTURE_FILES, (drive.levels, drive.lit_light), strict=False):
+        np.savetxt(folder / name, light, fmt="%.6f", delimiter=",", header=names, comments="")
+    (folder / PICTURE_FILES[-1]).write_bytes(encode_png(np.ascontiguousarray(drive.grey[..., ::-1])))
