@@ -22,14 +22,14 @@ _FAULTS = (ValueError, KeyError, MemoryError, OverflowError)
 _SEQUENTIAL, _PROGRESSIVE = (0xC0, 0xC1, 0xC9), (0xC2, 0xC6, 0xCA, 0xCE)
 _FRAMES = (*_SEQUENTIAL, *_PROGRESSIVE, 0xC3, 0xC5, 0xC7, 0xCB, 0xCD, 0xCF)
 _START, _END, _SCAN, _NOTES, _ADOBE = 0xD8, 0xD9, 0xDA, (*range(0xE0, 0xF0), 0xFE), 0xEE
-#: A marker with its padding; no stuffed byte, and no restart within a scan.
-_MARKER = re.compile(rb"\xff+[^\x00\x01\xff\xd0-\xd7]")
+#: A marker; no padding, no stuffed byte, and no restart within a scan.
+_MARKER = re.compile(rb"\xff[^\x00\x01\xff\xd0-\xd7]")
 #: Frames from here on are coded arithmetically, which shows no missing end.
 _ARITHMETIC = 0xC9
 #: Coefficients of a block.
 _BLOCK = 64
-#: Encoders use some ten; every scan goes over the whole picture.
-_MAX_SCANS = 100
+#: Encoders use some ten scans, each over the whole picture, and notes some hundred segments.
+_MAX_SCANS, _MAX_SEGMENTS = 100, 1 << 14
 _SURPLUS = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
 #: Bytes that the decoder may have read ahead when it counts the surplus.
 _READ_AHEAD = 16
@@ -85,7 +85,10 @@ def segments(data: bytes, beyond_scan: bool = False) -> Iterator[tuple[int, int,
     Stray bytes are passed over. With `beyond_scan` the segments between scans and the end marker follow.
     """
     at, is_header = 2, True
-    while found := _MARKER.search(data, at):
+    for _ in range(_MAX_SEGMENTS):
+        found = _MARKER.search(data, at)
+        if found is None:
+            return
         marker, at = data[found.end() - 1], found.end()
         if marker == _START and is_header:  # written twice
             continue

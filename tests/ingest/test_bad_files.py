@@ -98,6 +98,7 @@ BAD = {
     "entries.tif": (directory([(273, 4, 1, 100)] * 60_000, 800_000), "claim more than the file holds"),
     "progressive.jpg": (claiming_jpeg(PROGRESSIVE, b"\xff\xc2", 15_000), "would take"),
     "scans.jpg": (with_scans(PROGRESSIVE), "more than 100 scans"),
+    "segments.jpg": (b"\xff\xd8" + b"\xff\xfe\0\2" * 20_000 + PROGRESSIVE[2:], "header is damaged or cut"),
 }
 
 
