@@ -30,11 +30,13 @@ Picture = NDArray[np.float32] | NDArray[np.float64]
 #: Left, top, right, bottom, stored pixels; right and bottom are outside.
 Box = tuple[int, int, int, int]
 _STRIPS = 32
-#: Shortest side of a picture, pixels.
+#: Fewest lines along which stripes are sought.
 _MIN_SIDE = 24
 _MAX_LAMPS = 8
 #: Logarithm of the ratio of two line delays that may still be one.
 _SAME_LINE_DELAY = 0.02
+#: Readout from which it is doubted; periods of the blocks of codecs, and the relative distance at which one is equal.
+_LONG_READOUT_S, _BLOCKS_PX, _SAME_PERIOD = 0.1, (8, 16), 2e-3
 #: Smallest region of a lamp, as a share of the picture, by its number of periods.
 _MIN_AREA = ((2.0, 4.0, 6.0, 12.0), (0.15, 0.05, 0.015, 0.003))
 
@@ -90,6 +92,8 @@ class ShutterCalibration:
     warnings: tuple[str, ...] = ()
     #: Lens whose distortion the camera corrected, estimated with the line delay; None where stripes are straight.
     lens: LensModel | None = None
+    #: Why the stripes may be none of a lamp; a profile is then written on demand only.
+    doubts: tuple[str, ...] = ()
 
     @property
     def n_lines(self) -> int:
@@ -153,9 +157,9 @@ def _evidence(found: list[Stripes]) -> float:
 def _find_in(picture: Picture, box: Box, axis: Axis) -> list[Stripes]:
     """Find lamp after lamp in a part of the picture, each among the cells that the ones before left free."""
     part = picture[box[1] : box[3], box[0] : box[2]]
-    if min(part.shape) < _MIN_SIDE:
-        return []
     upright = part if axis == "rows" else part.T
+    if upright.shape[0] < _MIN_SIDE:
+        return []
     edges = np.linspace(0, upright.shape[1], min(_STRIPS, upright.shape[1]) + 1).astype(int)
     strips = np.add.reduceat(upright, edges[:-1], axis=1, dtype=np.float64).T / np.diff(edges)[:, None]
     free = np.ones(strips.shape, dtype=bool)
@@ -283,7 +287,7 @@ def calibrate_shutter(
     if window is not None:
         x, y, *size = window
         box = x, y, min(x + size[0], width), min(y + size[1], height)
-        if min(box[2] - x, box[3] - y) < _MIN_SIDE:
+        if min(box[2] - x, box[3] - y) < 1 or max(box[2] - x, box[3] - y) < _MIN_SIDE:
             reason = f"region {x},{y},{size[0]},{size[1]} lies outside the picture of {width}x{height}"
             raise UsageError(reason, "give it in stored pixels")
     by_picture = [find_stripes(picture, axis, box) for picture in pictures]
@@ -305,7 +309,23 @@ def calibrate_shutter(
     clearest = max((lamp for lamp, _ in used), key=lambda lamp: lamp.fit.explained * np.sqrt(lamp.area_px))
     exposure = estimate_exposure(clearest.fit, clearest.profile, value, exif_exposure_s, tone_known)
     notes, periods = _warnings(lamps, frequencies_hz, value), max(lamp.fit.periods for lamp, _ in used)
-    return ShutterCalibration(along, pictures[0].shape, value, sd, periods, exposure, tuple(lamps), tuple(notes))
+    result = ShutterCalibration(along, pictures[0].shape, value, sd, periods, exposure, tuple(lamps), tuple(notes))
+    return replace(result, doubts=_doubts(result, is_coded=not tone_known))
+
+
+def _doubts(result: ShutterCalibration, *, is_coded: bool) -> tuple[str, ...]:
+    """Why the stripes may be none of a lamp, of a picture that may have been coded in blocks."""
+    doubts = []
+    if result.readout_s > _LONG_READOUT_S:
+        doubts.append(
+            f"a readout of {1e3 * result.readout_s:.0f} ms is longer than that of nearly all cameras: the stripes may "
+            "be texture"
+        )
+    for lamp in result.lamps if is_coded else ():
+        block = next((px for px in _BLOCKS_PX if abs(lamp.period_px / px - 1) < _SAME_PERIOD), None)
+        if lamp.frequency_hz and block:
+            doubts.append(f"a period of {block} px is that of the blocks in which pictures and clips are coded")
+    return tuple(doubts)
 
 
 def _common_line_delay(regions: list[Stripes], frequencies_hz: Sequence[float]) -> float:

@@ -83,6 +83,7 @@ class _Results:
         lines: list[tuple[str, str]],
         metadata: Metadata | None,
         extend: Callable[[CameraProfile], CameraProfile],
+        doubts: tuple[str, ...] = (),
     ) -> None:
         """Write the result.
 
@@ -91,8 +92,14 @@ class _Results:
             lines: label and text each, for people; not printed where the JSON goes to stdout.
             metadata: the camera of a new profile.
             extend: adds the result to a profile.
+            doubts: why a profile should not be written.
+
+        Raises:
+            UsageError: a profile of a doubtful result is asked for without --force.
         """
         if self._target is not None:
+            if doubts and not self._force:
+                raise UsageError(f"no profile was written: {doubts[0]}", "use another lamp, or insist with --force")
             write_profile(extend(profile_to_extend(self._target, metadata)), self._target)
             lines = [*lines, ("written", str(self._target))]
         if self._json_path is not None:
@@ -256,10 +263,10 @@ def shutter(
         lights, tone_known = [light_of(frame) for frame in chosen], raw or chosen[0].linear
         known_s = chosen[0].metadata.exposure_s if exposure_s is None else exposure_s
         result = calibrate_shutter(lights, frequencies, along, known_s, window, tone_known)  # type: ignore[arg-type]
-    for warning in result.warnings:
+    for warning in (*result.warnings, *result.doubts):
         click.echo(f"vlc-rx: {warning}", err=True)
     record, lines = _shutter_report(result)
-    wanted.write(record, lines, chosen[0].metadata, lambda profile: _with_shutter(profile, result, mode))
+    wanted.write(record, lines, chosen[0].metadata, lambda profile: _with_shutter(profile, result, mode), result.doubts)
 
 
 def _frames(paths: list[Path], n: int) -> list[Frame]:
@@ -291,11 +298,12 @@ def _with_shutter(profile: CameraProfile, result: ShutterCalibration, mode: str 
 
 def _shutter_report(result: ShutterCalibration) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """The record of the JSON, and the lines for people."""
-    keys = ("readout_s", "readout_interval_s", "line_delay_s", "line_delay_interval_s", "periods", "axis", "warnings")
+    keys = ("readout_s", "readout_interval_s", "line_delay_s", "line_delay_interval_s", "periods", "axis")
     of_lamp = ("picture", "bounds", "frequency_hz", "period_px", "period_sd_px", "line_delay_s")
     of_fit = ("periods", "explained")
     exposure = result.exposure
     record: dict[str, Any] = {key: getattr(result, key) for key in keys}
+    record["warnings"] = [*result.warnings, *result.doubts]
     record |= {"height": result.shape[0], "width": result.shape[1], "exposure_s": exposure.exposure_s}
     record |= {"exposure_interval_s": exposure.interval_s, "exposure_note": exposure.comment}
     record["lens"] = None if result.lens is None else _lens_record(result.lens)

@@ -314,6 +314,35 @@ def test_refusals_and_unreadable_files(tmp_path: Path, capsys: pytest.CaptureFix
         assert reason in capsys.readouterr().err
 
 
+def test_a_narrow_strip_is_enough() -> None:
+    """Of a lamp at 5 kHz, as of a laser's reflection."""
+    strip = exposed(lamp(5000, 864, 2e-5)[:, None] * scene(864, 16), np.random.default_rng(3), gain=0.3)
+    assert calibrate_shutter([strip], [5000]).line_delay_s == pytest.approx(LINE_DELAY_S, rel=2e-3)
+
+
+def test_the_strip_across_a_red_laser(shared_captures: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = shared_captures.parent / "cases" / "shutter" / "red_strip.png"
+    assert run(["calibrate", "shutter", str(path), "--frequency", "5000", "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["line_delay_s"] == pytest.approx(9.11e-6, rel=3e-3)
+
+
+@pytest.mark.parametrize(("period_px", "doubt"), [(3.0, "readout of 400 ms"), (8.0, "period of 8 px"), (11.0, None)])
+def test_texture_and_blocks_are_doubted_and_give_no_profile(
+    period_px: float, doubt: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frequency_hz = 1 / (period_px * LINE_DELAY_S)
+    picture = exposed(lamp(frequency_hz, 480, 1e-6, None)[:, None] * scene(480, 200), np.random.default_rng(13))
+    path, profile = tmp_path / "a.png", tmp_path / "a.toml"
+    Image.fromarray(np.round(255 * picture).astype(np.uint8)).save(path)
+    claimed_hz = 400 if period_px == 3.0 else frequency_hz
+    arguments = ["calibrate", "shutter", str(path), "--frequency", str(claimed_hz), "--save", str(profile)]
+    assert run(arguments) == (ExitCode.USAGE if doubt else 0)
+    assert (doubt or "") in capsys.readouterr().err
+    assert profile.exists() == (doubt is None)
+    assert run([*arguments, "--force"]) == 0
+    assert profile.exists()
+
+
 def test_rotated_pictures_give_no_mode(lamp_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with Image.open(lamp_file) as picture:
         picture.transpose(Image.Transpose.TRANSPOSE).save(lamp_file)
