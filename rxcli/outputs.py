@@ -19,16 +19,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 from typing import TYPE_CHECKING
 
-from rxcli.errors import ExitCode, OutputError, ReceiverError, UsageError, reason_of
+from rxcli.errors import OutputError, ReceiverError, UsageError, reason_of
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-#: System errors that a different name avoids, and errors of the disk.
-_NAMED_WRONG = frozenset(
-    {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP}
-)
+#: Errors of the disk; a different name avoids the others.
 _DISK_FAILS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO})
 #: Marker file of folders that a command has written and that contain nothing to decode.
 OUTPUT_MARKER = ".vlc-rx-output"
@@ -158,7 +155,7 @@ def claim_folder(option: str, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         _try_to_write(folder)
     except (OSError, ValueError) as error:
-        raise _refusal(f"{option} {folder}", error, "name another folder") from None
+        raise unwritable(f"{option} {folder}", error, "name another folder") from None
 
 
 def _check_writable(output: Output) -> None:
@@ -169,19 +166,12 @@ def _check_writable(output: Output) -> None:
             path.open("r+b").close()
         _try_to_write(next(folder for folder in path.parents if folder.exists()))
     except (OSError, RuntimeError) as error:
-        raise _refusal(str(output), error, "name a file in a folder that can be written") from None
+        raise unwritable(output, error) from None
 
 
 def _try_to_write(folder: Path) -> None:
     """Create and remove a file in a folder, since permissions do not show read-only file systems."""
     TemporaryFile(prefix=".vlc-rx-", dir=folder).close()
-
-
-def _refusal(what: str, error: BaseException, step: str) -> ReceiverError:
-    """A usage error, or an output error if the disk is to blame."""
-    if getattr(error, "errno", None) in _DISK_FAILS:
-        return OutputError(f"{what}: cannot be written ({reason_of(error)})", "make room, or name another disk")
-    return UsageError(f"{what}: cannot be written ({reason_of(error)})", step)
 
 
 def claim_own_folder(option: str, folder: Path, known: Iterable[str] = (), force: bool = False) -> None:
@@ -207,7 +197,7 @@ def claim_own_folder(option: str, folder: Path, known: Iterable[str] = (), force
             reason = f"{option} {folder}: the folder holds files that this command did not write"
             raise UsageError(reason, "name a new folder, or an empty one")
     except OSError as error:
-        raise _refusal(f"{option} {folder}", error, "name another folder") from None
+        raise unwritable(f"{option} {folder}", error, "name another folder") from None
 
 
 def _identity(path: Path) -> object | None:
@@ -239,7 +229,7 @@ def is_stream(path: Path) -> bool:
         return False
 
 
-def _check_ours(output: Output) -> None:
+def _check_ours(output: Output, step: str = "name another file, or replace it with --force") -> None:
     try:
         with output.path.open("rb") as file:
             head = file.read(_SAMPLED_BYTES)
@@ -254,10 +244,7 @@ def _check_ours(output: Output) -> None:
     if head and ours and output.way_on is not None:
         raise UsageError(f"{output}: holds the results of an earlier run", output.way_on)
     if not ours:
-        raise UsageError(
-            f"{output}: there is such a file, and it is no earlier output of this option",
-            "name another file, or replace it with --force",
-        )
+        raise UsageError(f"{output}: there is such a file, and it is no earlier output of this option", step)
 
 
 @contextmanager
@@ -272,7 +259,7 @@ def replacing(path: Path, follow: bool = True) -> Iterator[Path]:
         follow: write to the device, to the pipe, or to the target of the link that `path` is; otherwise replace it.
 
     Raises:
-        OutputError: the file cannot be written; any `OSError` of the block ends so.
+        UsageError, OutputError: the file cannot be written; any `OSError` of the block ends so.
     """
     try:
         if follow and is_stream(path):
@@ -320,26 +307,19 @@ def check_replaceable(path: Path, ours: re.Pattern[bytes], option: str) -> None:
     """Refuse to replace a foreign file, for names that are known only when they are written.
 
     Raises:
-        OutputError: `path` exists and does not match `ours`.
+        UsageError: `path` exists and does not match `ours`.
     """
     if is_stream(path):
-        raise OutputError(f"{path}: is no file", "remove it, or name another folder")
-    try:
-        _check_ours(Output(option, path, ours))
-    except UsageError as error:
-        refusal = OutputError(error.message, "name another folder")
-        refusal.exit_code = error.exit_code
-        raise refusal from None
+        raise UsageError(f"{path}: is no file", "remove it, or name another folder")
+    _check_ours(Output(option, path, ours), "name another folder")
 
 
-def unwritable(path: Path, error: BaseException) -> OutputError:
-    """Error for a `path` that cannot be written, with the reason; a usage error unless the disk is to blame."""
-    refusal = OutputError(
-        f"{path}: cannot be written ({reason_of(error)})", "name a file in a folder that can be written"
-    )
-    if isinstance(error, OSError) and error.errno in _NAMED_WRONG:
-        refusal.exit_code = ExitCode.USAGE
-    return refusal
+def unwritable(
+    what: object, error: BaseException, step: str = "name a file in a folder that can be written"
+) -> ReceiverError:
+    """Error for an output that cannot be written, with the reason: wrong usage, unless the disk is to blame."""
+    kind = OutputError if getattr(error, "errno", None) in _DISK_FAILS else UsageError
+    return kind(f"{what}: cannot be written ({reason_of(error)})", step)
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:

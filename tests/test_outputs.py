@@ -16,7 +16,7 @@ from small_frames import write_frame, write_profiles
 
 from rxcli import outputs
 from rxcli.cli.main import run
-from rxcli.errors import InputError, OutputError, UsageError
+from rxcli.errors import InputError, OutputError, ReceiverError, UsageError
 from rxcli.link.saving import save_object
 from rxcli.outputs import Output, claim, replacing, write_whole
 from rxcli.results.dump import dump_stages
@@ -152,7 +152,7 @@ def test_what_fails_leaves_the_old_file_and_nothing_else(
     with pytest.raises(raised):
         fail()
     assert contents(tmp_path) == {"a.txt": b"old"}
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(UsageError, match="cannot be written"):
         write_whole(tmp_path / "none" / "a.txt", "new")
 
 
@@ -168,7 +168,7 @@ def test_a_link_is_followed_and_a_device_is_no_file(tmp_path: Path) -> None:
     write_whole(null, "new")
     assert null.is_char_device()
     for path, code in (("/dev/full", 3), ("/proc/none", 2)):  # a full disk, a wrong name
-        with pytest.raises(OutputError, match=f"{path}: cannot be written") as caught:
+        with pytest.raises(ReceiverError, match=f"{path}: cannot be written") as caught:
             write_whole(Path(path), "new")
         assert caught.value.exit_code == code
 
@@ -206,7 +206,7 @@ def test_a_received_file_replaces_a_pipe_or_a_link_and_is_not_written_into_it(ki
 
 def test_a_pipe_with_the_name_of_a_tap_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.jpg-000000.npz")
-    with pytest.raises(OutputError, match="is no file"):
+    with pytest.raises(UsageError, match="is no file"):
         dump_stages(tmp_path, "a.jpg", 0, {})
 
 

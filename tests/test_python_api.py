@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from collections.abc import Callable
@@ -45,9 +46,11 @@ def test_import_loads_nothing_heavy() -> None:
 
 
 def test_names_are_those_that_type_checkers_know() -> None:
-    text = Path(rxcli.__file__).read_text(encoding="utf-8")
-    known = {line.split()[-1] for line in text.splitlines() if line.startswith("    from rxcli.")}
-    assert known == set(rxcli.__all__) - {"__version__"} <= set(dir(rxcli))
+    tree = ast.parse(Path(rxcli.__file__).read_text(encoding="utf-8"))
+    [block] = [node for node in tree.body if isinstance(node, ast.If)]
+    known = [name.name for node in block.body if isinstance(node, ast.ImportFrom) for name in node.names]
+    assert sorted({*known, "__version__"} - {"Any"}) == sorted(rxcli.__all__)
+    assert set(rxcli.__all__) <= set(dir(rxcli))
     assert all(getattr(rxcli, name) is not None for name in rxcli.__all__)
     assert (Path(rxcli.__file__).parent / "py.typed").is_file()
     with pytest.raises(AttributeError, match="no attribute 'decoed'"):
@@ -158,7 +161,7 @@ MOSAIC = rxcli.Mosaic(np.zeros((2, 2), np.uint8), (1.0, 1.0, 1.0), (0.0, 0.0, 0.
             ({"pixels": pixels}, "must be a path, a Frame")
             for pixels in (None, [[1]], GREY[:0], GREY * 0.5, GREY[None])
         ),
-        *(({"white": white}, "white must be") for white in (NAN, None, "1", -1.0, 0.0)),
+        *(({"white": white}, "white above black") for white in (NAN, None, "1", -1.0, 0.0)),
         *(({"metadata": rxcli.Metadata(exposure_s=s)}, "exposure_s must") for s in (NAN, 0.0, -1.0, float("inf"), "1")),
         ({"metadata": rxcli.Metadata(iso=NAN)}, "iso must be"),
         ({"metadata": rxcli.Metadata(orientation=9)}, "orientation must be"),
@@ -170,7 +173,7 @@ MOSAIC = rxcli.Mosaic(np.zeros((2, 2), np.uint8), (1.0, 1.0, 1.0), (0.0, 0.0, 0.
         ({"mosaic": replace(MOSAIC, pattern=GREY[:0])}, r"mosaic\.pattern must be"),
         ({"mosaic": replace(MOSAIC, pattern=GREY[:2, :2] + 7)}, r"mosaic\.pattern must be"),
         ({"mosaic": replace(MOSAIC, gains=(NAN, 1.0, 1.0))}, r"mosaic\.gains must be"),
-        ({"mosaic": replace(MOSAIC, black=(0.0, 0.0, 300.0))}, r"mosaic\.white must be"),
+        ({"mosaic": replace(MOSAIC, black=(0.0, 0.0, 300.0))}, r"mosaic\.black\[2\] and white must be"),
     ],
 )
 def test_a_frame_with_impossible_values_is_refused(changed: dict[str, Any], reason: str) -> None:

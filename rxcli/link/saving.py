@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from rxcli.errors import InputError
+from rxcli.errors import InputError, ReceiverError
 from rxcli.link.formats import safe_name
 from rxcli.outputs import Taken, write_whole
 from rxcli.types import FrameResult, ReceivedObject
@@ -51,7 +51,7 @@ def save_objects(
     for received in result.objects:
         try:
             objects.append(save_object(received, folder, force, taken))
-        except InputError as error:
+        except ReceiverError as error:
             objects.append(received)
             on_error(str(error))
     return replace(result, objects=tuple(objects)) if objects else result

@@ -168,23 +168,25 @@ def _check_frame(frame: Frame) -> None:
         ("index", frame.index, is_number(frame.index, 0), "a number from 0"),
         ("time_s", frame.time_s, is_number(frame.time_s), "finite seconds"),
     )
-    positive = {name: getattr(about, name) for name in ("exposure_s", "iso", "focal_length_mm", "focal_length_35mm")}
+    lengths = {name: getattr(about, name) for name in ("exposure_s", "iso", "focal_length_mm", "focal_length_35mm")}
     check_values(
-        *((name, value, value is None or is_number(value, 1e-12), "above 0") for name, value in positive.items()),
+        *((name, value, value is None or is_number(value, 1e-12), "above 0") for name, value in lengths.items()),
         ("orientation", about.orientation, about.orientation in range(1, 9), "in 1..8"),
     )
-    levels = [("", frame.black, frame.white)]
+    levels = {"black": (frame.black, frame.white)}
     if mosaic is not None:
-        colours = np.asarray(mosaic.pattern)
+        colours, gains, black = np.asarray(mosaic.pattern), mosaic.gains, mosaic.black
         is_pattern = colours.ndim == 2 and colours.size > 0 and bool(np.isin(colours, range(3)).all())
-        check_values(("mosaic.pattern", mosaic.pattern, is_pattern, "a (h, w) array of the colours 0, 1, 2"))
-        for name, values, low in (("gains", mosaic.gains, 1e-12), ("black", mosaic.black, -np.inf)):
-            is_right = np.shape(values) == (3,) and all(is_number(value, low) for value in values)
-            check_values((f"mosaic.{name}", values, is_right, "three finite numbers"))
-        levels += [("mosaic.", black, mosaic.white) for black in mosaic.black]
-    for of, black, white in levels:
-        are_right = is_number(black) and is_number(white) and black < white
-        check_values((f"{of}white", (black, white), are_right, f"a number above that of {of}black"))
+        are_gains = np.shape(gains) == (3,) and all(is_number(gain, 1e-12) for gain in gains)
+        check_values(
+            ("mosaic.pattern", mosaic.pattern, is_pattern, "a (h, w) array of the colours 0, 1, 2"),
+            ("mosaic.gains", gains, are_gains, "three positive numbers"),
+            ("mosaic.black", black, np.shape(black) == (3,), "three numbers"),
+        )
+        levels = {f"mosaic.black[{n}]": (level, mosaic.white) for n, level in enumerate(black)}
+    for of, pair in levels.items():
+        are_right = all(map(is_number, pair)) and pair[0] < pair[1]
+        check_values((f"{of} and white", pair, are_right, "numbers, white above black"))
 
 
 def _numbered(pictures: Iterable[Picture]) -> Iterator[Frame]:

@@ -180,13 +180,13 @@ def test_a_journal_is_not_written_through_a_link(tmp_path: Path, monkeypatch: py
     with pytest.raises(UsageError, match="is a link"):
         Journal(path)
     monkeypatch.setattr(Path, "is_symlink", lambda _: False)
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(UsageError, match="cannot be written"):
         Journal(path)
     assert victim.read_text() == "mine"
 
 
 def test_a_journal_that_cannot_be_written_says_so(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(UsageError, match="cannot be written"):
         Journal(tmp_path / "no such folder" / "out.jsonl")
     full = Journal(Path("/dev/full"))
     with pytest.raises(InputError, match="No space left"):
