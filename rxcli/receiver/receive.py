@@ -134,15 +134,11 @@ def _receive_screen(
         reception, denoised, report = apply_autoencoder(acquisition, reception, options)
     # Packets, with the probability that they are right.
     columns = assemble.column_results(
-        reception.clock,
+        assemble.FrameColumns(reception.clock, reception.snr, no_header, options.min_confidence, outline.certainty),
         reception.posteriors,
-        reception.snr,
         reception.n_observed,
         reception.confidence_features(reception.posteriors, denoised),
-        no_header,
-        options.min_confidence,
         denoised,
-        outline.certainty,
     )
     if camera.reversed:
         columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)

@@ -41,7 +41,7 @@ def column_map(frame: Frame) -> dict[str, Any] | None:
         else "No grid of columns stands out: no strips of pixels change together.",
         "caption": "Bright: neighbouring strips of pixels change together from row to row, as they do in front of a "
         "backlight however dark the picture is. Lines: borders of columns, across which they do not.",
-        **_drawn(frame, read_strips(plane).lit),
+        **_drawn(frame, read_strips(plane).coherence),
         "grids": [
             {
                 "pitch_px": grid.pitch_px,

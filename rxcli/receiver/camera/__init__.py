@@ -9,11 +9,11 @@ from rxcli.receiver.camera.camera import camera_profile, in_time_order, lens_of,
 from rxcli.receiver.camera.curvature import curvature_terms
 from rxcli.receiver.camera.fit import settle
 from rxcli.receiver.camera.proposals import CameraHypothesis, propose
-from rxcli.receiver.camera.strips import Strips, strips_of
+from rxcli.receiver.camera.strips import ColumnStrips, strips_of
 
 __all__ = [
     "CameraHypothesis",
-    "Strips",
+    "ColumnStrips",
     "camera_profile",
     "curvature_terms",
     "in_time_order",

@@ -7,7 +7,7 @@ import numpy as np
 from rxcli.numerics import TINY
 from rxcli.receiver.camera.proposals import stripe_rows
 from rxcli.receiver.camera.settings import SETTINGS
-from rxcli.receiver.camera.strips import Strips, levelled
+from rxcli.receiver.camera.strips import ColumnStrips, levelled
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
 NO_HEADERS = (
@@ -16,7 +16,7 @@ NO_HEADERS = (
 )
 
 
-def why_not(strips: Strips) -> str:
+def why_not(strips: ColumnStrips) -> str:
     """Why no clock was found: what the picture looks like, and the next step."""
     likeness, lit = stripe_likeness(strips)
     striped = lit & (likeness > SETTINGS.striped_likeness)
@@ -42,7 +42,7 @@ def why_not(strips: Strips) -> str:
     return NO_HEADERS
 
 
-def stripe_likeness(strips: Strips) -> tuple[FloatArray, BoolArray]:
+def stripe_likeness(strips: ColumnStrips) -> tuple[FloatArray, BoolArray]:
     """Correlation of neighbouring strips in bands of rows, 0..1; and whether a band is lit."""
     level, weight = levelled(strips.light, strips.inside, SETTINGS.likeness_rows, strips.noise)
     blocks = np.linspace(0, strips.rows.size, SETTINGS.likeness_bands + 1).astype(int)[:-1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rxcli.receiver.camera.settings import SETTINGS
-from rxcli.receiver.camera.strips import Strips
+from rxcli.receiver.camera.strips import ColumnStrips
 from rxcli.types import Float32Array, FloatArray
 
 
@@ -30,12 +30,12 @@ def curvature_terms(x: FloatArray, rows: FloatArray, width: int, height: int) ->
 _UNIT: FloatArray = np.array([1.0, -1.0, 0.0, 0.0])
 
 
-def straightened(strips: Strips, level: Float32Array, curvature: FloatArray) -> Float32Array:
+def straightened(strips: ColumnStrips, level: Float32Array, curvature: FloatArray) -> Float32Array:
     """(M, R) levelled light read along the bent stripes: every row of the result is one sensor row, 0 out of view."""
     return _moved(level, _moved_rows(strips, 1, curvature)) if curvature.any() else level
 
 
-def likeliest_bend(strips: Strips, level: Float32Array) -> FloatArray:
+def likeliest_bend(strips: ColumnStrips, level: Float32Array) -> FloatArray:
     """(4,) bend, other than none, under which the levelled light (M, R) of neighbouring columns is most similar."""
     strips_per_column = level.shape[0] // strips.n_columns
     level, moved = level[::strips_per_column], _moved_rows(strips, strips_per_column, _UNIT)
@@ -44,7 +44,7 @@ def likeliest_bend(strips: Strips, level: Float32Array) -> FloatArray:
     return np.asarray(bends[np.argmax([(light[:-1] * light[1:]).sum() for light in straight])] * _UNIT)
 
 
-def _moved_rows(strips: Strips, step: int, curvature: FloatArray) -> FloatArray:
+def _moved_rows(strips: ColumnStrips, step: int, curvature: FloatArray) -> FloatArray:
     """(M / step, R) rows by which a bend moves every row of each `step`-th strip."""
     terms = curvature_terms(strips.x[::step], strips.rows, strips.width, strips.height)
     return np.asarray(np.tensordot(curvature, terms, 1) / strips.pitch)

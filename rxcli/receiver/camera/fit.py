@@ -14,7 +14,7 @@ from rxcli.numerics import TINY, local_mean
 from rxcli.receiver.camera.curvature import curvature_terms
 from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.receiver.camera.settings import SETTINGS
-from rxcli.receiver.camera.strips import Strips, joined
+from rxcli.receiver.camera.strips import ColumnStrips, joined
 from rxcli.receiver.light import SlotLight, column_light
 from rxcli.types import Clock, Float32Array, FloatArray
 
@@ -26,7 +26,7 @@ _PRECISION[:2, :2] += 0.2**-2
 
 
 def settle(
-    strips: Strips,
+    strips: ColumnStrips,
     hypothesis: CameraHypothesis,
     clock: Clock,
     lit: Float32Array,
@@ -103,7 +103,7 @@ class _Model:
     A row-time map is (6,) start, rows per slot, k1, k2, p1, p2.
     """
 
-    def __init__(self, strips: Strips, lit: Float32Array, light_spread: float, rows_per_slot: float) -> None:
+    def __init__(self, strips: ColumnStrips, lit: Float32Array, light_spread: float, rows_per_slot: float) -> None:
         shares = column_light(strips.light.shape[0], strips.n_columns, light_spread)
         mixed = np.asarray(shares / shares.sum(axis=1, keepdims=True) @ lit, np.float32)
         self.strips = strips

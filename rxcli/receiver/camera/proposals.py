@@ -18,7 +18,7 @@ from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.curvature import likeliest_bend, straightened
 from rxcli.receiver.camera.settings import SETTINGS
-from rxcli.receiver.camera.strips import Strips, columns_of, joined, levelled
+from rxcli.receiver.camera.strips import ColumnStrips, columns_of, joined, levelled
 from rxcli.types import Float32Array, FloatArray
 
 #: Samples a slot at which headers are sought; bins of the spectrum to a line's width.
@@ -50,7 +50,7 @@ class CameraHypothesis:
 
 
 def propose(
-    strips: Strips, screens: Sequence[ScreenProfile], exposure_s: float | None = None, *, may_bend: bool = True
+    strips: ColumnStrips, screens: Sequence[ScreenProfile], exposure_s: float | None = None, *, may_bend: bool = True
 ) -> list[CameraHypothesis]:
     """Cameras that may have taken a picture, the best few.
 
@@ -78,7 +78,7 @@ def propose(
     return distinct
 
 
-def stripe_rows(strips: Strips) -> float:
+def stripe_rows(strips: ColumnStrips) -> float:
     """Rows of the lag at which columns are half as like themselves as a row later; 0 where there are no stripes.
 
     Texture that is wider than the stripes counts as well, so that levels follow what was found.
@@ -120,7 +120,7 @@ def _is_same(candidate: CameraHypothesis, better: CameraHypothesis) -> bool:
 
 
 def _clocks(
-    strips: Strips, level: Float32Array, bend: FloatArray, width: float, exposures: dict[int, float]
+    strips: ColumnStrips, level: Float32Array, bend: FloatArray, width: float, exposures: dict[int, float]
 ) -> Iterator[CameraHypothesis]:
     """Clocks that stand out on stripes of one bend, in any order."""
     straight = straightened(strips, level, bend)

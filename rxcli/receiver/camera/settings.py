@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
-class CameraSettings:
+class EstimateSettings:
     """Each with its unit and the reason for it."""
 
     #: Strips that a column keeps.
@@ -72,4 +72,4 @@ class CameraSettings:
     striped_share: float = 0.7
 
 
-SETTINGS = CameraSettings()
+SETTINGS = EstimateSettings()

@@ -1,4 +1,4 @@
-"""Strips: the light of a picture, two strips a column, before anything is known of its camera."""
+"""Strips of columns: the light of a picture, two strips a column, before anything is known of its camera."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rxcli.types import Float32Array, FloatArray, RowProfiles
 
 
 @dataclass(frozen=True, slots=True)
-class Strips:
+class ColumnStrips:
     """Light of M strips on R rows; the strips of a column lie side by side."""
 
     #: (M, R) float32: light; and 1 where it is on the screen, else 0.
@@ -36,7 +36,7 @@ class Strips:
         return float(self.rows[1] - self.rows[0]) if self.rows.size > 1 else 1.0
 
 
-def strips_of(profiles: RowProfiles, x: FloatArray, width: int, height: int) -> Strips:
+def strips_of(profiles: RowProfiles, x: FloatArray, width: int, height: int) -> ColumnStrips:
     """Strips from row profiles.
 
     Args:
@@ -55,7 +55,7 @@ def strips_of(profiles: RowProfiles, x: FloatArray, width: int, height: int) -> 
 
     inside: Float32Array = np.asarray(pooled(profiles.inside).all(axis=1), np.float32)
     pixels = max(float(np.median(profiles.count)), 1.0) * join
-    return Strips(
+    return ColumnStrips(
         light=pooled(profiles.light).mean(axis=1) * inside,
         inside=inside,
         x=pooled(x).mean(axis=1, dtype=np.float64),
@@ -67,7 +67,7 @@ def strips_of(profiles: RowProfiles, x: FloatArray, width: int, height: int) -> 
     )
 
 
-def joined(strips: Strips, n: int) -> Strips:
+def joined(strips: ColumnStrips, n: int) -> ColumnStrips:
     """The strips with means of `n` neighbouring rows."""
     if n == 1:
         return strips

@@ -5,8 +5,9 @@ and, where each shows little, on a clock (`common_clock`); the camera is known o
 outline, clock, picture and light spread are known: the strips are read where they were (`plane.tracked`), the picture
 is taken out (`scene`, by `channel.known_picture`), the clock is predicted and checked against the header
 (`sync.tracking`). Where the check fails, the frame is received like a photograph again. The link's time numbers the
-bursts of all frames (`link`), and what frames show of a burst is added up before it is detected (`bursts`). A packet
-stands in the last frame that shows its burst, so results wait a frame (`ledger`) until they are complete (`reporting`).
+bursts of all frames (`timeline`), and what frames show of a burst is added up before it is detected (`bursts`). A
+packet stands in the last frame that shows its burst, so results wait a frame (`ledger`) until they are complete
+(`reporting`).
 """
 
 from rxcli.receiver.clip.receiver import receive_clip

@@ -103,7 +103,7 @@ def _first_header(profiles: RowProfiles, screen: ScreenProfile, rows_per_slot: f
     q, top = sync_settings.search_samples, float(profiles.rows[0]) - 0.5
     step = rows_per_slot / q
     light, valid = sync.resample(profiles, top, step, int(profiles.rows.size / step))
-    pooled, weight = sync.header_contrast(light, valid, noise_of(profiles) / np.sqrt(max(step, 1.0)))
+    pooled, weight = sync.search_contrast(light, valid, noise_of(profiles) / np.sqrt(max(step, 1.0)))
     response = sync.header_response(pooled, weight, q).mean(axis=0)
     power = folded(np.maximum(response, 0) ** 2, screen.packet_slots * q)
     # Time stamps are rounded to milliseconds: neighbouring places are equivalent.

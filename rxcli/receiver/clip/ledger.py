@@ -10,10 +10,10 @@ import numpy as np
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.clip.bursts import Burst, bursts_of, doubts, lit_slots
 from rxcli.receiver.clip.common_clock import Start
-from rxcli.receiver.clip.link import Link
 from rxcli.receiver.clip.reporting import Reporter
 from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.settings import SETTINGS
+from rxcli.receiver.clip.timeline import Timeline
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.sync import tracking
 from rxcli.types import Frame, FrameResult, OnTaps
@@ -44,8 +44,8 @@ class Ledger:
         #: Bursts that are still going on, by number.
         self._bursts: dict[int, Burst] = {}
         #: The link's time that holds now, and the one before.
-        self._link: Link | None = None
-        self._earlier_link: Link | None = None
+        self._timeline: Timeline | None = None
+        self._earlier_timeline: Timeline | None = None
         #: Ratio of time stamps to the link's time; None if it cannot be estimated, and frames are received alone.
         self._stretch: float | None = 1.0
         #: The scene of the frames that wait; None where they are not tracked.
@@ -61,8 +61,8 @@ class Ledger:
     @property
     def time(self) -> tracking.LinkTime:
         """The link's time, once a frame was received."""
-        assert self._link is not None
-        return self._link.time
+        assert self._timeline is not None
+        return self._timeline.time
 
     @property
     def message(self) -> str | None:
@@ -73,9 +73,9 @@ class Ledger:
 
     def has_certain_bursts(self, frame: Frame, scene: TrackedScreen) -> bool:
         """Whether all bursts that a frame should show are certain in all lit columns."""
-        if self._link is None or scene.last is None or self._n_held:
+        if self._timeline is None or scene.last is None or self._n_held:
             return False
-        numbers = self._link.predicted(frame, scene.rows, scene.last.acquisition.clock.rows_per_slot)
+        numbers = self._timeline.predicted(frame, scene.rows, scene.last.acquisition.clock.rows_per_slot)
         lit = np.median(scene.last.snr, axis=1) >= 1
         bursts = [self._bursts[number] for number in numbers if number in self._bursts]
         return len(bursts) == len(numbers) > 0 and bool(lit.any()) and all(burst.certain[lit].all() for burst in bursts)
@@ -95,39 +95,39 @@ class Ledger:
             view: what was received of it.
             scene: that the frame belongs to; None where it is not tracked.
         """
-        link, done = self._link, []
-        if link is None or self._stretch is None or not link.place(view):
+        timeline, done = self._timeline, []
+        if timeline is None or self._stretch is None or not timeline.place(view):
             done = self._finish_scene()
-            self._earlier_link = link or self._earlier_link
-            link = self._link = self._begun_link(view)
+            self._earlier_timeline = timeline or self._earlier_timeline
+            timeline = self._timeline = self._begun_timeline(view)
         waiting.view, self._scene = view, scene
         self._waiting.append(waiting)
         with view.context.timer("detect"):
-            if self._n_held and self._stretch == 1 and link.time.judged and not link.stamps_judged:
-                stretch = link.estimate_stretch(self._views[0])
-                if stretch != link.time.stretch:
+            if self._n_held and self._stretch == 1 and timeline.time.judged and not timeline.stamps_judged:
+                stretch = timeline.estimate_stretch(self._views[0])
+                if stretch != timeline.time.stretch:
                     return done + self._enter_stretched(stretch)
-            if link.phase.settled or len(self._views) > SETTINGS.first_frames:
-                self._number_frames(link)
+            if timeline.phase.settled or len(self._views) > SETTINGS.first_frames:
+                self._number_frames(timeline)
                 if self._n_held and len(self._waiting) >= self._n_held:
                     self._measure_again()
         return done + self._ready()
 
-    def _begun_link(self, view: View) -> Link:
+    def _begun_timeline(self, view: View) -> Timeline:
         """Begin the link's time anew with a frame."""
-        before, stretch = self._earlier_link, self._stretch or 1.0
-        link = Link.begin(view, self.start, stretch)
-        if not link.place(view):
+        before, stretch = self._earlier_timeline, self._stretch or 1.0
+        timeline = Timeline.begin(view, self.start, stretch)
+        if not timeline.place(view):
             # The clock that the first frames seemed to share is not this frame's.
-            self.start, link = None, Link.begin(view, None, stretch)
-            link.place(view)
+            self.start, timeline = None, Timeline.begin(view, None, stretch)
+            timeline.place(view)
         self._bursts = {}
-        return link if before is None else link.after(before, view.context.frame)
+        return timeline if before is None else timeline.after(before, view.context.frame)
 
     def _enter_stretched(self, stretch: float | None) -> list[FrameResult]:
         """Enter all frames anew by another ratio of their time stamps; returns the results that are complete."""
         waiting, scene, done = self._waiting, self._scene, []
-        self._stretch, self._waiting, self._link = stretch, deque(), None
+        self._stretch, self._waiting, self._timeline = stretch, deque(), None
         for each in waiting:
             each.update(message=self.message)
             if each.view is not None:
@@ -147,11 +147,11 @@ class Ledger:
         numbers = [] if view.numbers is None else view.numbers.tolist()
         return [self._bursts[number] for number in numbers if number in self._bursts]
 
-    def _number_frames(self, link: Link) -> None:
+    def _number_frames(self, timeline: Timeline) -> None:
         """Number the bursts of the frames that waited for it, add them, and learn the picture from them."""
         for view in self._views:
             if view.numbers is None:
-                link.number(view)
+                timeline.number(view)
                 self._add_bursts(view)
                 if self._scene is not None and view.flat is not None:
                     self._scene.update(view, partial(lit_slots, view, self._open(view)))
@@ -184,8 +184,8 @@ class Ledger:
 
     def finish(self) -> list[FrameResult]:
         """The results still held back."""
-        if self._link is not None:
-            self._number_frames(self._link)
+        if self._timeline is not None:
+            self._number_frames(self._timeline)
         if self._n_held:
             self._measure_again(at_last=True)
         done = self._ready()
@@ -212,7 +212,7 @@ class Ledger:
 
     def _report(self, waiting: Waiting, following: View | None) -> FrameResult:
         """The result of a frame: the packets of its bursts that the `following` one does not show."""
-        if waiting.view is None or self._link is None:
+        if waiting.view is None or self._timeline is None:
             return waiting.result
         shown = set() if following is None else {burst.number for burst in self._open(following)}
         own = self._open(waiting.view)
@@ -220,4 +220,4 @@ class Ledger:
         for burst in closed:
             del self._bursts[burst.number]
         going_on = [burst for burst in own if burst.number in shown]
-        return self._reporter.completed(waiting, self._link, closed, going_on, self.certainty)
+        return self._reporter.completed(waiting, self._timeline, closed, going_on, self.certainty)

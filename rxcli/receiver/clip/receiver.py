@@ -56,7 +56,7 @@ def receive_clip(
 class Known:
     """What every state knows of a clip."""
 
-    #: Link time, bursts and results that wait: these add up over all frames.
+    #: Timeline time, bursts and results that wait: these add up over all frames.
     ledger: Ledger
     camera: ClipCamera
     #: (4, 2) of the screen in the last frame that showed it.

@@ -10,7 +10,7 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.clip.bursts import Burst
-from rxcli.receiver.clip.link import Link
+from rxcli.receiver.clip.timeline import Timeline
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.confidence import BurstInClip
@@ -27,13 +27,13 @@ class Reporter:
     on_taps: OnTaps | None
 
     def completed(
-        self, waiting: Waiting, link: Link, closed: Sequence[Burst], going_on: Sequence[Burst], certainty: float
+        self, waiting: Waiting, timeline: Timeline, closed: Sequence[Burst], going_on: Sequence[Burst], certainty: float
     ) -> FrameResult:
         """The result of a received frame.
 
         Args:
             waiting: the frame.
-            link: that numbered its bursts.
+            timeline: that numbered its bursts.
             closed: its bursts that no later frame shows.
             going_on: its other bursts.
             certainty: probability that the screen's columns are numbered right.
@@ -41,14 +41,11 @@ class Reporter:
         result, view = waiting.result, waiting.view
         assert view is not None
         ended = [burst.ended(view) for burst in closed]
+        headerless = timeline.headerless(ended, len(view.snr))
         columns = assemble.clip_results(
-            view.bursts.clock,
+            assemble.FrameColumns(view.bursts.clock, view.snr, headerless, self.options.min_confidence, certainty),
             ended,
             lambda column: any(burst.probability(column) >= BELIEVABLE for burst in going_on),
-            view.snr,
-            link.headerless(ended, len(view.snr)),
-            self.options.min_confidence,
-            certainty,
         )
         if view.denoised:
             columns = tuple(replace(column, denoised=column.column in view.denoised) for column in columns)
@@ -58,10 +55,10 @@ class Reporter:
             self.on_taps(result.source, result.frame, _taps(result, view, ended))
         soft = None
         if self.options.soft_bits:
-            soft = clip_soft_bits(ended, assemble.snr_db_of_columns(view.snr), link.epoch)
+            soft = clip_soft_bits(ended, assemble.snr_db_of_columns(view.snr), timeline.epoch)
         if soft is not None:
             soft = replace(soft, source=result.source, frame=result.frame, time_s=result.time_s)
-        name = view.acquisition.variant(link.phase.repeats).name
+        name = view.acquisition.variant(timeline.phase.repeats).name
         status = assemble.clip_status(columns)
         return replace(result, columns=columns, status=status, screen_profile=name, soft_bits=soft)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from operator import itemgetter
 
 import numpy as np
@@ -105,7 +105,8 @@ class TrackedScreen:
             return None
         with timer("detect"):
             lit = known_picture.first_decision(columns, known_picture.row_positions(pose.rows, clock), clock)
-            measured = _measured(picture, pose.rows, light, columns, clock, lit, last.isi_memory, max_misfit)
+            observed = _Observed(pose.rows, light, columns, last.isi_memory)
+            measured = _measured(picture, observed, clock, lit, max_misfit)
             if measured is None:
                 return None
             columns, clock, likelihoods = measured
@@ -254,7 +255,8 @@ class TrackedScreen:
         columns = picture.solve(view.light)
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:
             return
-        measured = _measured(picture, pose.rows, view.light, columns, clock, known, view.isi_memory, SETTINGS.misfit)
+        observed = _Observed(pose.rows, view.light, columns, view.isi_memory)
+        measured = _measured(picture, observed, clock, known, SETTINGS.misfit)
         if measured is not None:
             view.flat, clock, found = measured
             view.snr = found.snr
@@ -271,25 +273,31 @@ def followed_outline(frame: Frame, corners: FloatArray, screen: ScreenProfile) -
     return None if found is None else found[order]
 
 
+@dataclass(frozen=True, slots=True)
+class _Observed:
+    """Light of a frame."""
+
+    #: (R,) sensor rows, (C, S, R) light of the strips there, and the columns' own light.
+    rows: FloatArray
+    light: Float32Array
+    columns: ColumnLight
+    #: Number of earlier slots that influence the light of a slot.
+    isi_memory: int
+
+
 def _measured(
-    picture: PlacedPicture,
-    rows: FloatArray,
-    light: Float32Array,
-    columns: ColumnLight,
-    clock: Clock,
-    lit: Float32Array,
-    isi_memory: int,
-    max_misfit: float,
+    picture: PlacedPicture, observed: _Observed, clock: Clock, lit: Float32Array, max_misfit: float
 ) -> tuple[ColumnLight, Clock, SlotLikelihoods] | None:
     """Correct clock, response and noise of a frame by its decided slots `lit` (C, N); then likelihoods.
 
     None where the light does not fit the decisions: another scene, or something in front of the screen.
     """
+    rows, columns, isi_memory = observed.rows, observed.columns, observed.isi_memory
     positions = known_picture.row_positions(rows, clock)
     fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
     if fit.response.centre < SETTINGS.faded:
         expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit.response)
-        columns = picture.solve_again(light, expected.light, clock.rows_per_slot)
+        columns = picture.solve_again(observed.light, expected.light, clock.rows_per_slot)
         fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
     if abs(fit.late) > SETTINGS.late_slots:
         clock = replace(clock, row0=clock.row0 - fit.late * clock.rows_per_slot)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -34,73 +35,83 @@ OUT_OF_VIEW = "it is out of the picture; turn the camera, or move back, until th
 _GOES_ON = "its burst goes on in the next frame and is reported there"
 
 
+@dataclass(frozen=True)
+class FrameColumns:
+    """What is known of a frame's columns beside their packets."""
+
+    clock: Clock
+    #: (C, N) squared contrast over variance of every slot of the grid.
+    snr: Float32Array
+    #: (C,) columns without packets, see `find_headerless`.
+    headerless: BoolArray
+    #: Packets below it are left out.
+    min_confidence: float
+    #: Probability that the columns' numbers are right.
+    certainty: float = 1.0
+
+    @cached_property
+    def snr_db(self) -> list[float | None]:
+        """See `snr_db_of_columns`."""
+        return snr_db_of_columns(self.snr)
+
+
 def column_results(
-    clock: Clock,
+    frame: FrameColumns,
     posteriors: BurstPosteriors,
-    snr: Float32Array,
     n_observed: IntArray,
     confidence_features: FloatArray,
-    headerless: BoolArray,
-    min_confidence: float,
     denoised: frozenset[int] = frozenset(),
-    certainty: float = 1.0,
 ) -> tuple[ColumnResult, ...]:
     """Results of every column of a photograph.
 
     Args:
-        clock: the clock.
+        frame: the columns.
         posteriors: of B bursts and C columns.
-        snr: (C, N) squared contrast over variance of every slot of the grid.
         n_observed: (B, C, packet) see `slots_observed`.
         confidence_features: (B, C, 8) of the packets.
-        headerless: (C,) columns without packets, see `find_headerless`.
-        min_confidence: packets below it are left out.
         denoised: columns that were corrected by the auto-encoder.
-        certainty: probability that the columns' numbers are right.
     """
-    snr_db, quality = snr_db_of_columns(snr), still_quality(posteriors, confidence_features)
-    bursts = [
-        _burst(clock, index, posteriors, index, quality, n_observed_of_burst, snr_db, certainty)
-        for index, n_observed_of_burst in enumerate(n_observed)
-    ]
+    quality = still_quality(posteriors, confidence_features)
+    shown = [_Shown(index, index, posteriors, observed) for index, observed in enumerate(n_observed)]
+    bursts = [_burst(frame, burst, quality) for burst in shown]
     sure = quality.confidence >= SETTINGS.min_best_confidence
-    if not any((burst.possible & ~headerless)[sure[index]].any() for index, burst in enumerate(bursts)):
+    if not any((burst.possible & ~frame.headerless)[sure[index]].any() for index, burst in enumerate(bursts)):
         # Light without data: an isolated packet is chance.
         bursts = [replace(burst, possible=np.zeros_like(burst.possible)) for burst in bursts]
-    columns = _columns(clock, bursts, snr_db, headerless, lambda column: False, min_confidence)
+    columns = _columns(frame, bursts, lambda column: False)
     return tuple(replace(column, denoised=column.column in denoised) for column in columns)
 
 
 def clip_results(
-    clock: Clock,
-    bursts: Sequence[BurstInClip],
-    goes_on: Callable[[int], bool],
-    snr: Float32Array,
-    headerless: BoolArray,
-    min_confidence: float,
-    certainty: float = 1.0,
+    frame: FrameColumns, bursts: Sequence[BurstInClip], goes_on: Callable[[int], bool]
 ) -> tuple[ColumnResult, ...]:
     """Results of every column in a frame of a clip.
 
     Args:
-        clock: the clock.
+        frame: the columns.
         bursts: bursts that end in this frame, in time order.
         goes_on: whether the next frame will report a packet of a column.
-        snr: (C, N) squared contrast over variance of every slot of the grid.
-        headerless: (C,) columns without packets, see `find_headerless`.
-        min_confidence: packets below it are left out.
-        certainty: probability that the columns' numbers are right.
     """
-    snr_db = snr_db_of_columns(snr)
     ended = [
-        _burst(
-            *(clock, burst.index, burst.posteriors, 0, clip_quality(burst), burst.n_observed, snr_db, certainty),
-            number=burst.number,
-            frames=burst.frames,
-        )
-        for burst in bursts
+        _burst(frame, _Shown(b.index, 0, b.posteriors, b.n_observed, b.number, b.frames), clip_quality(b))
+        for b in bursts
     ]
-    return _columns(clock, ended, snr_db, headerless, goes_on, min_confidence)
+    return _columns(frame, ended, goes_on)
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """What a frame, or a clip up to it, shows of a burst."""
+
+    #: Index in the frame's clock, and in posteriors and quality.
+    index: int
+    place: int
+    posteriors: BurstPosteriors
+    #: (C, packet) how often each slot was observed.
+    n_observed: IntArray
+    #: Number and frames in the clip; None of photographs.
+    number: int | None = None
+    frames: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,21 +128,11 @@ class _Burst:
     possible: BoolArray
 
 
-def _burst(
-    clock: Clock,
-    index: int,
-    posteriors: BurstPosteriors,
-    place: int,
-    quality: Quality,
-    n_observed: IntArray,
-    snr_db: Sequence[float | None],
-    certainty: float,
-    number: int | None = None,
-    frames: tuple[int, ...] | None = None,
-) -> _Burst:
-    """Packets of the burst `index` of a clock, which is at `place` in posteriors and quality."""
+def _burst(frame: FrameColumns, shown: _Shown, quality: Quality) -> _Burst:
+    """Packets of a burst."""
+    clock, posteriors, place, n_observed = frame.clock, shown.posteriors, shown.place, shown.n_observed
     copies = n_observed.sum(axis=1) / clock.packet_slots
-    rows = _header_rows(int((clock.burst == index).argmax()), clock)
+    rows = _header_rows(int((clock.burst == shown.index).argmax()), clock)
     payloads = _payloads(posteriors.index[place], posteriors.w)
     packets = [
         PacketResult(
@@ -139,10 +140,10 @@ def _burst(
             copies=n_copies,
             payload_bits=bits_per_symbol(w) * posteriors.index.shape[2],
             payload=payload,
-            confidence=certainty * confidence,
+            confidence=frame.certainty * confidence,
             ber_hat=ber_hat,
-            burst=number,
-            frames=frames,
+            burst=shown.number,
+            frames=shown.frames,
             confidence_features=tuple(features),
         )
         for first_row, n_copies, w, payload, confidence, ber_hat, features in zip(
@@ -157,8 +158,8 @@ def _burst(
         )
     ]
     # In a clip, a later frame shows what is missing.
-    whole = complete(n_observed, 0 if frames else SETTINGS.max_missing_slots)
-    echo = whole & echoes(posteriors, snr_db)[place]
+    whole = complete(n_observed, 0 if shown.frames else SETTINGS.max_missing_slots)
+    echo = whole & echoes(posteriors, frame.snr_db)[place]
     possible = whole & ~echo & (quality.ber_hat[place] <= SETTINGS.max_ber_hat)
     return _Burst(packets, posteriors.w, n_observed, whole, echo, possible)
 
@@ -180,17 +181,10 @@ def _header_rows(copy: int, clock: Clock) -> FloatArray:
     return np.asarray(clock.row0 + slots * clock.rows_per_slot)
 
 
-def _columns(
-    clock: Clock,
-    bursts: Sequence[_Burst],
-    snr_db: Sequence[float | None],
-    headerless: BoolArray,
-    goes_on: Callable[[int], bool],
-    min_confidence: float,
-) -> tuple[ColumnResult, ...]:
+def _columns(frame: FrameColumns, bursts: Sequence[_Burst], goes_on: Callable[[int], bool]) -> tuple[ColumnResult, ...]:
     """Results of every column; a column that `goes_on` has packets in the next frame."""
-    out = []
-    for column, db in enumerate(snr_db):
+    out, headerless, min_confidence = [], frame.headerless, frame.min_confidence
+    for column, db in enumerate(frame.snr_db):
         possible = [burst for burst in bursts if burst.possible[column] and not headerless[column]]
         reported = [burst for burst in possible if burst.packets[column].confidence >= min_confidence]
         packets = tuple(burst.packets[column] for burst in reported)
@@ -216,7 +210,7 @@ def _columns(
                 # Without a packet the weight is not reliable.
                 w=next((int(b.w[column]) for b in reported if b.packets[column].confidence == confidence), None),
                 snr_db=db,
-                delay_slots=float(clock.delay_slots[column]),
+                delay_slots=float(frame.clock.delay_slots[column]),
                 packets=packets,
                 message=message,
             )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen.grid import Grid, grid_through
-from rxcli.receiver.screen.strips import Strips
+from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import Float32Array, FloatArray
 
 #: Columns across the picture, or across a fifth of it, and their step; minimum number of strips per column.
@@ -62,7 +62,7 @@ def likeness(sigma: float, distance: float) -> float:
     return float(cosine.mean())
 
 
-def find_combs(strips: Strips, sigma: float) -> list[Comb]:
+def find_combs(strips: PictureStrips, sigma: float) -> list[Comb]:
     """The strongest combs, strongest first; none if the strongest may be chance.
 
     Args:
@@ -78,7 +78,7 @@ def find_combs(strips: Strips, sigma: float) -> list[Comb]:
     return [comb for comb in chosen if chosen[0].score > _MIN_COMB]
 
 
-def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
+def grid_of_comb(comb: Comb, strips: PictureStrips) -> Grid:
     """The grid of the whole picture that is nearest to a comb of some strips."""
     raw_x, raw_y, x, y = (values.ravel() for values in (strips.raw_x, strips.raw_y, strips.x, strips.y))
     local_x, local_y = (raw_x - raw_x.mean()) * strips.n_parts, raw_y * strips.n_parts
@@ -89,7 +89,7 @@ def grid_of_comb(comb: Comb, strips: Strips) -> Grid:
     return grid_through(grid, x, y, comb.phase + comb.pitch * bent)
 
 
-def _all_combs(strips: Strips, sigma: float) -> list[Comb]:
+def _all_combs(strips: PictureStrips, sigma: float) -> list[Comb]:
     """The best comb of each pitch."""
     step = strips.step * strips.n_parts
     max_pitch = min(_MAX_PITCH, 1 / (_MIN_COLUMN_STRIPS * step))
@@ -98,10 +98,10 @@ def _all_combs(strips: Strips, sigma: float) -> list[Comb]:
     y = strips.raw_y.mean(axis=1) * strips.n_parts
     found: list[Comb] = []
     for distance in np.unique(distances).tolist():
-        lit_pairs = strips.lit[:, :-distance] * strips.lit[:, distance:]
+        lit_pairs = strips.coherence[:, :-distance] * strips.coherence[:, distance:]
         tried = pitches[distances == distance]
         mean = likeness(sigma, round(float(tried.mean()) * distance * step, 2))
-        rest = np.sqrt(lit_pairs) * strips.coherence(distance) - np.float32(mean) * lit_pairs
+        rest = np.sqrt(lit_pairs) * strips.coherence_at(distance) - np.float32(mean) * lit_pairs
         chance = np.sqrt(float(lit_pairs.sum()) / (2 * strips.n_rows)) + TINY
         # Pairs across a border are less coherent. Combs are scaled to their standard deviation by chance, so that
         # different distances can be compared.

@@ -21,7 +21,7 @@ from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
 from rxcli.receiver.screen.numbering import LightProfile, centred, first_columns, light_profile
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.rows import find_rows
-from rxcli.receiver.screen.strips import Strips, read_strips, shows_narrow_columns
+from rxcli.receiver.screen.strips import PictureStrips, read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
 from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
 
@@ -107,15 +107,15 @@ def shows_narrow(plane: LightPlane) -> bool:
     return strips is not None and shows_narrow_columns(strips.without_common_light())
 
 
-def _strips_of(plane: LightPlane, lens: Lens | None) -> Strips | None:
+def _strips_of(plane: LightPlane, lens: Lens | None) -> PictureStrips | None:
     """The strips of a picture, or None if its size shows no screen."""
     if size_refused(plane.width, plane.height):
         return None
     strips = read_strips(plane, lens)
-    return strips if strips.lit.shape[1] >= _MIN_STRIPS else None
+    return strips if strips.coherence.shape[1] >= _MIN_STRIPS else None
 
 
-def _screens_apart(strips: Strips, layouts: Sequence[ColumnLayout]) -> list[list[Outline]]:
+def _screens_apart(strips: PictureStrips, layouts: Sequence[ColumnLayout]) -> list[list[Outline]]:
     """Candidate outlines of two screens side by side, or none: together they light more columns than one has."""
     sides = strips.sides_of_gap()
     found = [(side, grid) for side in sides for grid in wide_grids(side, layouts[0].sigma)[:1]]
@@ -173,12 +173,12 @@ def follow_outline(plane: LightPlane, corners: FloatArray, layout: ColumnLayout)
     grid = with_light(strips, grid, layout.sigma)
     if not _stands_out(strips, grid):
         return None
-    light = predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), layout.sigma)
+    light = predicted_light(strips, columns_at(grid.coefficients, strips.x, strips.y), layout.sigma)
     flat, ends, has_bars = find_rows(strips, light, grid, n, layout.aspect)
     return flat.corners(flat.ends_of(corners) if has_bars else ends)  # With bars the rows are where they were.
 
 
-def wide_grids(strips: Strips, sigma: float, rivals: Sequence[Grid] = (), least: float = 1.0) -> list[Grid]:
+def wide_grids(strips: PictureStrips, sigma: float, rivals: Sequence[Grid] = (), least: float = 1.0) -> list[Grid]:
     """The grid of wide columns that explains the strips' light best, and one that does nearly as well, if any.
 
     Args:
@@ -207,13 +207,13 @@ def _score(grid: Grid) -> float:
     return grid.explained + grid.contrast
 
 
-def _differ(strips: Strips, grid: Grid, rival: Grid) -> bool:
+def _differ(strips: PictureStrips, grid: Grid, rival: Grid) -> bool:
     """Whether two grids differ in more than the number of the first column."""
-    off = columns_at(grid.numbers, strips.x, strips.y) - columns_at(rival.numbers, strips.x, strips.y)
+    off = columns_at(grid.coefficients, strips.x, strips.y) - columns_at(rival.coefficients, strips.x, strips.y)
     return bool(np.abs(off - np.round(np.median(off))).mean() > _DIFFERENT)
 
 
-def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
+def narrow_grid(strips: PictureStrips, sigma: float) -> Grid | None:
     """The grid of narrow columns, or None: parts of the picture are searched, and a clear grid is followed outwards."""
     some, few = (strips.blocks(slice(None, None, step)) for step in (2, 4))
     for part in sorted(range(strips.n_parts), key=lambda part: abs(part - strips.n_parts // 2)):
@@ -229,7 +229,7 @@ def narrow_grid(strips: Strips, sigma: float) -> Grid | None:
     return None
 
 
-def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
+def _followed(strips: PictureStrips, grid: Grid, middle: float, sigma: float) -> Grid:
     """Extend a grid from the part of a picture around `middle` to the whole width."""
     reach = 0.5 / _PARTS
     while reach < 0.5 + abs(middle):
@@ -240,13 +240,13 @@ def _followed(strips: Strips, grid: Grid, middle: float, sigma: float) -> Grid:
     return grid
 
 
-def _stands_out(strips: Strips, grid: Grid, least: float = 1.0) -> bool:
+def _stands_out(strips: PictureStrips, grid: Grid, least: float = 1.0) -> bool:
     """Whether borders half a column further on explain less, by `least` times what chance gives."""
     by_chance = grid.explained / np.sqrt(strips.picture_rows)
     return bool(grid.contrast > least * by_chance)
 
 
-def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout], rank: int = 0) -> list[Outline]:
+def _numbered(strips: PictureStrips, grid: Grid, layouts: Sequence[ColumnLayout], rank: int = 0) -> list[Outline]:
     """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
     light, profile = _light_across(strips, grid, layouts[0].sigma)
     stands_out = _stands_out(strips, grid)
@@ -255,12 +255,12 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout], rank:
         columns, odds, fills = first_columns(profile, layout.n_columns)
         best, n = int(columns[odds.argmax()]), layout.n_columns
         own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, _LAST_STEPS, n_columns=n)
-        plane, ends, has_bars = find_rows(strips, light, own, n, layout.aspect)
+        axis, ends, has_bars = find_rows(strips, light, own, n, layout.aspect)
         if not has_bars:
             odds = odds + centred(profile.film, columns, n)
         for number, log_odds in zip(columns.tolist(), odds.tolist(), strict=True):
             if log_odds > odds.max() + _MIN_LOG_ODDS:
-                corners, counted = plane.corners(ends, number - best), own.shifted(number - best)
+                corners, counted = axis.corners(ends, number - best), own.shifted(number - best)
                 unlit = (profile.ends[0] - number, number + n - profile.ends[1])
                 sides = _unlit_sides(corners, unlit, has_bars, (strips.width, strips.height))
                 found.append(
@@ -281,9 +281,9 @@ def _numbered(strips: Strips, grid: Grid, layouts: Sequence[ColumnLayout], rank:
     return sorted(found, key=lambda candidate: -candidate.log_odds)
 
 
-def _light_across(strips: Strips, grid: Grid, sigma: float) -> tuple[Float32Array, LightProfile]:
+def _light_across(strips: PictureStrips, grid: Grid, sigma: float) -> tuple[Float32Array, LightProfile]:
     """Light of the strips that a grid predicts, and its profile across the columns."""
-    light = predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), sigma)
+    light = predicted_light(strips, columns_at(grid.coefficients, strips.x, strips.y), sigma)
     return light, light_profile(strips, light, grid)
 
 

@@ -129,8 +129,8 @@ def screen_to_picture(points: FloatArray, corners: FloatArray, lens: Lens | None
         corners: (4, 2) pixels of the stored picture, the viewer's top-left first.
         lens: lens model of the picture; None or corrected: the screen's sides are straight.
     """
-    plane = undistort(corners, bending(lens))
-    projected = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ homography(plane).T
+    flat = undistort(corners, bending(lens))
+    projected = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ homography(flat).T
     return distort(projected[..., :2] / projected[..., 2:], bending(lens))
 
 

@@ -28,7 +28,7 @@ class Grid:
     """Columns as a function of the position in a picture."""
 
     #: (6,) u0, a, b, g, h, and the radial coefficient, see the module's text.
-    numbers: FloatArray
+    coefficients: FloatArray
     width: int
     height: int
     #: Known lens of the picture; None: no lens, or an unknown one.
@@ -41,37 +41,37 @@ class Grid:
     @property
     def pitch_px(self) -> float:
         """Width of a column at the picture's middle, pixels."""
-        return float(self.width / self.numbers[1])
+        return float(self.width / self.coefficients[1])
 
     @property
     def estimated_lens(self) -> Lens | None:
         """Lens with the estimated radial coefficient, or None if the lens is known."""
         if self.lens is not None:
             return None
-        radial = self.numbers[5]
+        radial = self.coefficients[5]
         matrix = np.array([[self.width, 0, (self.width - 1) / 2], [0, self.width, (self.height - 1) / 2], [0, 0, 1.0]])
         # `distort` goes the other way: the inverse series.
         return Lens(matrix, np.array([-radial, 3 * radial**2, 0.0, 0.0, 0.0]), corrected=False)
 
     def columns_at(self, points: FloatArray) -> FloatArray:
         """(...) columns of (..., 2) pixels."""
-        return columns_at(self.numbers, *flat_places(points, self.width, self.height, self.lens))
+        return columns_at(self.coefficients, *flat_places(points, self.width, self.height, self.lens))
 
     def flat(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Offsets of (..., 2) pixels from the picture's middle in picture widths, with lens distortion removed."""
-        return straightened(self.numbers[5], *flat_places(points, self.width, self.height, self.lens))
+        return straightened(self.coefficients[5], *flat_places(points, self.width, self.height, self.lens))
 
     def pixels_of(self, flat: FloatArray) -> FloatArray:
         """(n, 2) pixels of (n, 2) offsets, the inverse of `flat`."""
         distorted = flat
         for _ in range(_INVERSE_STEPS):
-            distorted = flat / (1 + self.numbers[5] * (distorted**2).sum(axis=-1, keepdims=True))
+            distorted = flat / (1 + self.coefficients[5] * (distorted**2).sum(axis=-1, keepdims=True))
         pixels = distorted * self.width + np.array([(self.width - 1) / 2, (self.height - 1) / 2])
         return geometry.distort(pixels, geometry.bending(self.lens))
 
     def shifted(self, columns: float) -> Grid:
         """The grid with its columns renumbered from column `columns` on."""
-        return replace(self, numbers=self.numbers - np.array([columns, 0, 0, 0, 0, 0]))
+        return replace(self, coefficients=self.coefficients - np.array([columns, 0, 0, 0, 0, 0]))
 
 
 def grid_between(corners: FloatArray, n_columns: int, size: tuple[int, int], lens: Lens | None) -> Grid:
@@ -93,12 +93,14 @@ def grid_between(corners: FloatArray, n_columns: int, size: tuple[int, int], len
 
 def grid_through(grid: Grid, x: FloatArray, y: FloatArray, u: FloatArray) -> Grid:
     """The grid nearest to columns `u` (n,) at (n,) offsets from the picture's middle; `grid` is the start."""
-    numbers = grid.numbers
+    coefficients = grid.coefficients
     x, y, u = (values[::_EVERY] for values in (x, y, u))
     for _ in range(_STEPS):
-        off = u - columns_at(numbers, x, y)
-        numbers = numbers + grid_step(numbers, off, np.full(off.shape, _PRECISION), grid_slopes(numbers, x, y))
-    return replace(grid, numbers=numbers)
+        off = u - columns_at(coefficients, x, y)
+        coefficients = coefficients + grid_step(
+            coefficients, off, np.full(off.shape, _PRECISION), grid_slopes(coefficients, x, y)
+        )
+    return replace(grid, coefficients=coefficients)
 
 
 def straightened(radial: float, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -107,16 +109,16 @@ def straightened(radial: float, x: FloatArray, y: FloatArray) -> tuple[FloatArra
     return x * scale, y * scale
 
 
-def columns_at(numbers: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+def columns_at(coefficients: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
     """(...) columns at (...) offsets from the picture's middle, see the module's text."""
-    u0, a, b, g, h, radial = numbers
+    u0, a, b, g, h, radial = coefficients
     x, y = straightened(radial, x, y)
     return np.asarray(u0 + (a * x + b * y) / (1 + g * x + h * y))
 
 
-def grid_slopes(numbers: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """(6, ...) derivatives of the columns by the six numbers."""
-    _, a, b, g, h, radial = numbers
+def grid_slopes(coefficients: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """(6, ...) derivatives of the columns by the six coefficients."""
+    _, a, b, g, h, radial = coefficients
     r2 = x * x + y * y
     x, y = straightened(radial, x, y)
     below = 1 + g * x + h * y
@@ -125,11 +127,11 @@ def grid_slopes(numbers: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray
     return np.stack([np.ones_like(x), x / below, y / below, -u * x / below, -u * y / below, r2 * (by_x * x + by_y * y)])
 
 
-def grid_step(numbers: FloatArray, off: FloatArray, weight: FloatArray, slopes: FloatArray) -> FloatArray:
+def grid_step(coefficients: FloatArray, off: FloatArray, weight: FloatArray, slopes: FloatArray) -> FloatArray:
     """(6,) Gauss-Newton step of a grid's parameters that moves its columns by `off`, with the priors.
 
     Args:
-        numbers: (6,) of the grid.
+        coefficients: (6,) of the grid.
         off: (n,) columns.
         weight: (n,) their precision.
         slopes: (6, n), see `grid_slopes`.
@@ -137,5 +139,5 @@ def grid_step(numbers: FloatArray, off: FloatArray, weight: FloatArray, slopes: 
     tilt, radial = _PERSPECTIVE_SD**-2, _RADIAL_SD**-2
     prior = np.array([0, 0, 0, tilt, tilt, radial])
     normal = (slopes * weight) @ slopes.T
-    gradient = slopes @ (weight * off) - prior * numbers
+    gradient = slopes @ (weight * off) - prior * coefficients
     return np.asarray(np.linalg.solve(normal + np.diag(prior + 1e-3 * np.diag(normal)), gradient))

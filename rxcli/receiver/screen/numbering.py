@@ -12,7 +12,7 @@ import numpy as np
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen.grid import Grid, columns_at
-from rxcli.receiver.screen.strips import Strips
+from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Parts of a column in which light is measured, and those in which its level is measured.
@@ -67,7 +67,7 @@ class LightProfile:
         return left + start / _PARTS, left + end / _PARTS
 
 
-def light_profile(strips: Strips, light: Float32Array, grid: Grid) -> LightProfile:
+def light_profile(strips: PictureStrips, light: Float32Array, grid: Grid) -> LightProfile:
     """Measure the light across the columns of a grid.
 
     Args:
@@ -75,7 +75,7 @@ def light_profile(strips: Strips, light: Float32Array, grid: Grid) -> LightProfi
         light: (B, S, R) products of the strips with the waveforms predicted from their neighbours, `predicted_light`.
         grid: of the picture.
     """
-    u = columns_at(grid.numbers, strips.x, strips.y)
+    u = columns_at(grid.coefficients, strips.x, strips.y)
     origin = int(np.floor(u.min())) - 1
     n = (int(np.ceil(u.max())) + 1 - origin) * _PARTS
     part = ((u - origin) * _PARTS).astype(np.int64).ravel()
@@ -92,10 +92,10 @@ def light_profile(strips: Strips, light: Float32Array, grid: Grid) -> LightProfi
     place = origin + (np.arange(n) + 0.5) / _PARTS
     by_block = np.maximum(light.mean(axis=(1, 2)), 0.0)
     film, frame = _film(np.where(by_block[:, None] > 0, strips.level, 0), u), _framed(place, odds, steady)
-    return LightProfile(place, count > 0, np.where(count > 0, odds, 0.0), float(grid.numbers[0]), film, frame)
+    return LightProfile(place, count > 0, np.where(count > 0, odds, 0.0), float(grid.coefficients[0]), film, frame)
 
 
-def _steady_light(strips: Strips, part: IntArray, odds: FloatArray) -> FloatArray:
+def _steady_light(strips: PictureStrips, part: IntArray, odds: FloatArray) -> FloatArray:
     """(P,) log-odds that a part without light of the columns is off the screen, by the light that never goes out there.
 
     The screen is dark whenever all its columns are; a room is not.

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rxcli.receiver.screen.grid import Grid
-from rxcli.receiver.screen.strips import Strips
+from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import FloatArray, Lens
 
 #: Certainty from which the number of a column is likely.
@@ -38,7 +38,7 @@ class Outline:
     n_columns: int | None = None
     #: Strips of the picture on which it was found, and their columns, numbered from the screen's first; None where it
     #: was given.
-    strips: Strips | None = field(default=None, repr=False, compare=False)
+    strips: PictureStrips | None = field(default=None, repr=False, compare=False)
     grid: Grid | None = field(default=None, repr=False, compare=False)
 
     @property

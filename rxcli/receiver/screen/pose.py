@@ -14,9 +14,11 @@ import numpy as np
 from rxcli.numerics import TINY
 from rxcli.receiver.light import SlotLight
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.screen.find import ColumnLayout
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_slopes
-from rxcli.receiver.screen.rows import Plane
-from rxcli.receiver.screen.strips import LONG_ROWS, Strips
+from rxcli.receiver.screen.outline import Outline
+from rxcli.receiver.screen.rows import ScreenAxis
+from rxcli.receiver.screen.strips import LONG_ROWS, PictureStrips
 from rxcli.receiver.screen.waveforms import Mixes, offsets
 from rxcli.types import Clock, Float32Array, FloatArray, Lens
 
@@ -28,10 +30,8 @@ _MIN_WAVE = 1e-3
 
 
 def corners_by_slots(
-    strips: Strips,
-    corners: FloatArray,
-    aspect: float,
-    sigma: float,
+    outline: Outline,
+    layout: ColumnLayout,
     clock: Clock,
     lit: Float32Array,
     lens: Lens | None,
@@ -41,47 +41,47 @@ def corners_by_slots(
     """Move corners to the column positions that decided slots give; returns (4, 2) pixels.
 
     Args:
-        strips: of the picture.
-        corners: (4, 2) pixels in the viewer's order, right to some tenths of a column.
-        aspect: width over height of the screen.
-        sigma: light spread of the screen, column pitches.
+        outline: that was found in the picture, in the viewer's order, right to some tenths of a column.
+        layout: of the screen's columns.
         clock: of the slots.
         lit: (C, N) probability that each slot of the clock's grid is lit.
         lens: of the picture, known or estimated.
         is_reversed: whether the stored rows run against the readout.
     """
-    n_columns = len(lit)
+    strips, corners, n_columns = outline.strips, outline.corners, len(lit)
+    assert strips is not None
     start = _start(strips, corners, n_columns, lens)
-    column = columns_at(start.numbers, strips.x, strips.y)
+    column = columns_at(start.coefficients, strips.x, strips.y)
     waves = _waves(strips, column, clock, lit, lens, is_reversed)
-    numbers, sd = start.numbers, _POSE_SD * n_columns
+    coefficients, sd = start.coefficients, _POSE_SD * n_columns
     # The lens stays fixed: the strips were read through it.
     prior = np.array([sd, sd, sd, _TILT_SD, _TILT_SD, 1e-6]) ** -2.0
-    slopes = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
+    slopes = grid_slopes(coefficients, strips.x, strips.y).reshape(coefficients.size, -1)
     for _ in range(_STEPS):
-        mixes = Mixes.of(columns_at(numbers, strips.x, strips.y), sigma, n_columns)
+        mixes = Mixes.of(columns_at(coefficients, strips.x, strips.y), layout.sigma, n_columns)
         columns = np.clip(mixes.first_column.astype(np.int64) + np.arange(mixes.share.shape[2]), 0, n_columns - 1)
         windows = np.tile(np.arange(strips.n_windows), strips.n_parts)
         known = waves[windows[:, None], columns]
         off, weight = offsets(known, strips.changes, mixes.share, mixes.slopes(), strips.n_rows)
         normal = (slopes * weight.ravel()) @ slopes.T + np.diag(prior)
-        gradient = slopes @ (weight * off).ravel() - prior * (numbers - start.numbers)
-        numbers = numbers + np.linalg.solve(normal, gradient)
+        gradient = slopes @ (weight * off).ravel() - prior * (coefficients - start.coefficients)
+        coefficients = coefficients + np.linalg.solve(normal, gradient)
     # The middle of the screen stays on its row, and the screen as high as it was.
-    plane = Plane.through(replace(start, numbers=numbers), n_columns, aspect, float(corners[:, 1].mean()))
-    return plane.corners(plane.ends_of(corners))
+    grid, row = replace(start, coefficients=coefficients), float(corners[:, 1].mean())
+    axis = ScreenAxis.through(grid, n_columns, layout.aspect, row)
+    return axis.corners(axis.ends_of(corners))
 
 
-def _start(strips: Strips, corners: FloatArray, n_columns: int, lens: Lens | None) -> Grid:
+def _start(strips: PictureStrips, corners: FloatArray, n_columns: int, lens: Lens | None) -> Grid:
     """Grid between corners, columns in the viewer's order; an estimated lens becomes its radial coefficient."""
     grid = grid_between(corners, n_columns, (strips.width, strips.height), lens)
     if strips.lens is not None or lens is None or lens.corrected:
         return replace(grid, lens=strips.lens)
-    return replace(grid, lens=None, numbers=grid.numbers - np.array([0, 0, 0, 0, 0, lens.dist_coeffs[0]]))
+    return replace(grid, lens=None, coefficients=grid.coefficients - np.array([0, 0, 0, 0, 0, lens.dist_coeffs[0]]))
 
 
 def _waves(
-    strips: Strips, column: FloatArray, clock: Clock, lit: Float32Array, lens: Lens | None, is_reversed: bool
+    strips: PictureStrips, column: FloatArray, clock: Clock, lit: Float32Array, lens: Lens | None, is_reversed: bool
 ) -> Float32Array:
     """Band-passed light of the columns (W, C, R) on the rows of strips at columns (B, S)."""
     n_windows, n_rows, n_columns = strips.n_windows, strips.changes.shape[2], len(lit)

@@ -126,7 +126,7 @@ class ScreenTexture:
         height, width = (sides[1] + sides[3]) / 2, (sides[0] + sides[2]) / 2
         #: Pixels of a cell across and down.
         self._cell = max(round(width / _CELLS[1]), 1), max(round(height / _CELLS[0]), 1)
-        self._plane = geometry.undistort(corners, self._lens)
+        self._flat = geometry.undistort(corners, self._lens)
         self._n_frames = 0
         #: Value and weight of the known texture, and the same on coarse and on fine cells; None if to be recomputed.
         self._mean: Float32Array = np.zeros((*_CELLS, 2), np.float32)
@@ -138,22 +138,22 @@ class ScreenTexture:
         """Register the screen in the next frame."""
         if self._known is None:
             self._known = _known_of(_coarser(self._mean), 1), _known_of(self._mean, _COMPARED_OF)
-        plane = self._plane
+        flat = self._flat
         fine = self._texture_of(frame)
         coarse = _Texture(_coarser(fine.values), fine.origin, fine.cell * _COARSE[::-1])
         for texture, known in zip((coarse, fine), self._known, strict=True):
-            plane, sd_px, correlation = self._fit(texture, known, plane)
-        return Registration(geometry.distort(plane, self._lens), sd_px, correlation)
+            flat, sd_px, correlation = self._fit(texture, known, flat)
+        return Registration(geometry.distort(flat, self._lens), sd_px, correlation)
 
     def learn(self, frame: Frame, found: Registration) -> None:
         """Update the texture with a frame in which the screen was found."""
-        self._plane = geometry.undistort(found.corners, self._lens)
+        self._flat = geometry.undistort(found.corners, self._lens)
         self._n_frames += 1
         if self._n_frames > _FIRST_FRAMES and self._n_frames % _LEARN_EVERY:
             return
         self._known = None
         texture = self._texture_of(frame)
-        value, weight = self._read(texture, self._plane, _points(*_CELLS))
+        value, weight = self._read(texture, self._flat, _points(*_CELLS))
         mean, before = np.moveaxis(self._mean, 2, 0)
         total = before + weight
         mean += (value - mean) * (weight / np.maximum(total, np.float32(TINY)))
@@ -162,7 +162,7 @@ class ScreenTexture:
     def _texture_of(self, frame: Frame) -> _Texture:
         """The texture of a frame around the last place of the screen and in its middle; that of one frame is cached."""
         if self._read_last is None or self._read_last[0] is not frame:
-            corners = geometry.distort(self._plane, self._lens)
+            corners = geometry.distort(self._flat, self._lens)
             reach = _REACH * _size(corners)
             size = np.array([frame.width, frame.height])
             start = (corners.min(axis=0) - reach).clip(0, size // 4).astype(int)
@@ -170,21 +170,21 @@ class ScreenTexture:
             self._read_last = frame, _texture_of(frame, start, end, *self._cell)
         return self._read_last[1]
 
-    def _fit(self, texture: _Texture, known: _Known, plane: FloatArray) -> tuple[FloatArray, float, float]:
+    def _fit(self, texture: _Texture, known: _Known, flat: FloatArray) -> tuple[FloatArray, float, float]:
         """Corners (4, 2) on the undistorted picture, their standard deviation, and the textures' correlation.
 
         Args:
             texture: of the frame.
             known: of the screen, on cells of the same size.
-            plane: corners to begin with.
+            flat: corners to begin with.
         """
-        prior, (shares, pairs) = _prior_of_one() / _size(plane) ** 2, _corner_shares()
+        prior, (shares, pairs) = _prior_of_one() / _size(flat) ** 2, _corner_shares()
         # From the corners' motion along u and v to pixels, with the screen approximated by a parallelogram.
-        side_u, side_v = plane[1] - plane[0] + plane[2] - plane[3], plane[3] - plane[0] + plane[2] - plane[1]
+        side_u, side_v = flat[1] - flat[0] + flat[2] - flat[3], flat[3] - flat[0] + flat[2] - flat[1]
         inverse = np.linalg.inv(np.stack([side_u, side_v], axis=1) / 2)
         to_pixels = (np.eye(4)[:, :, None] * inverse[:, None, None]).reshape(8, 8)
         for _ in range(_ITERATIONS):
-            value, weight = self._read(texture, plane, known.points)
+            value, weight = self._read(texture, flat, known.points)
             error, weight = known.value - value, weight * known.trust
             squared = error * error
             variance = max(float(np.vdot(weight, squared)) / max(float(weight.sum()), TINY), TINY)
@@ -194,21 +194,21 @@ class ScreenTexture:
             normal = to_pixels.T @ along_corners @ to_pixels
             along = np.einsum("npk,pk->np", known.gradient, weight * error)
             noise = _CORRELATED_CELLS * variance
-            slope = (along @ shares.T).ravel() @ to_pixels / noise + prior @ (self._plane - plane).ravel()
+            slope = (along @ shares.T).ravel() @ to_pixels / noise + prior @ (self._flat - flat).ravel()
             step = np.linalg.solve(normal / noise + prior, slope) * _STEP_SHARE
-            plane = plane + step.reshape(4, 2)
+            flat = flat + step.reshape(4, 2)
             if np.abs(step.reshape(4, 2) / texture.cell).max() < _CONVERGED:
                 break
         power = float((weight * known.value**2).sum() * (weight * value**2).sum())
         correlation = float((weight * known.value * value).sum()) / max(power, TINY**2) ** 0.5
         sd_px = float(np.sqrt(np.trace(np.linalg.inv(normal / noise + prior)) / 8))
-        return plane, sd_px, correlation
+        return flat, sd_px, correlation
 
-    def _read(self, texture: _Texture, plane: FloatArray, points: FloatArray) -> tuple[Float32Array, Float32Array]:
-        """Texture (n, m) at `points` (3, n, m) of the screen, with the screen at `plane`; and its weight, 0 outside."""
+    def _read(self, texture: _Texture, flat: FloatArray, points: FloatArray) -> tuple[Float32Array, Float32Array]:
+        """Texture (n, m) at `points` (3, n, m) of the screen, with the screen at `flat`; and its weight, 0 outside."""
         import cv2
 
-        x, y, scale = np.tensordot(geometry.homography(plane), points, 1)
+        x, y, scale = np.tensordot(geometry.homography(flat), points, 1)
         pixels = geometry.distort(np.stack([x / scale, y / scale], axis=-1), self._lens)
         cells = ((pixels + (0.5 - texture.origin)) / texture.cell - 0.5).astype(np.float32)
         read = np.asarray(cv2.remap(texture.values, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR))

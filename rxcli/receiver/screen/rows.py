@@ -12,7 +12,7 @@ import numpy as np
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen.grid import Grid, columns_at, straightened
-from rxcli.receiver.screen.strips import Strips
+from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import Float32Array, FloatArray
 
 #: Bins along the screen in which light is measured, and their range beyond its ends, screen heights.
@@ -26,7 +26,7 @@ _FOCAL_WIDTHS = 0.8
 
 
 @dataclass(frozen=True, slots=True)
-class Plane:
+class ScreenAxis:
     """The coordinate along the columns, 0 at the top and 1 at the bottom: v = (v0 + c x + d y) / (1 + g x + h y)."""
 
     grid: Grid
@@ -36,13 +36,13 @@ class Plane:
     d: float
 
     @classmethod
-    def through(cls, grid: Grid, n_columns: int, aspect: float, row: float) -> Plane:
-        """The plane with its middle on a row of the picture; the grid is numbered from the screen's first column.
+    def through(cls, grid: Grid, n_columns: int, aspect: float, row: float) -> ScreenAxis:
+        """The coordinate with its middle on a row of the picture; the grid is numbered from the screen's first column.
 
         The vanishing line of a flat screen gives its normal, and the columns its direction across. The direction along
         the columns is at right angles to both.
         """
-        u0, a, b, g, h, _ = grid.numbers
+        u0, a, b, g, h, _ = grid.coefficients
         focal = _FOCAL_WIDTHS if grid.lens is None else grid.lens.camera_matrix[0, 0] / grid.width
         depth = np.array([g * focal, h * focal, 1.0])
         normal = depth / np.linalg.norm(depth)
@@ -58,14 +58,14 @@ class Plane:
 
     def along(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """(...) v of offsets from the picture's middle, with lens distortion removed."""
-        _, _, _, g, h, _ = self.grid.numbers
+        _, _, _, g, h, _ = self.grid.coefficients
         return np.asarray((self.v0 + self.c * x + self.d * y) / (1 + g * x + h * y))
 
     def pixels(self, points: FloatArray) -> FloatArray:
         """(n, 2) pixels of (n, 2) columns and v."""
-        u0, a, b, g, h, _ = self.grid.numbers
-        to_plane = np.linalg.inv([[a, b, 0], [self.c, self.d, self.v0], [g, h, 1]])
-        x, y, scale = to_plane @ np.stack([points[:, 0] - u0, points[:, 1], np.ones(len(points))])
+        u0, a, b, g, h, _ = self.grid.coefficients
+        to_screen = np.linalg.inv([[a, b, 0], [self.c, self.d, self.v0], [g, h, 1]])
+        x, y, scale = to_screen @ np.stack([points[:, 0] - u0, points[:, 1], np.ones(len(points))])
         return self.grid.pixels_of(np.stack([x / scale, y / scale], axis=-1))
 
     def corners(self, ends: tuple[float, float], first_column: int = 0) -> FloatArray:
@@ -80,9 +80,9 @@ class Plane:
 
 
 def find_rows(
-    strips: Strips, light: Float32Array, grid: Grid, n_columns: int, aspect: float
-) -> tuple[Plane, tuple[float, float], bool]:
-    """The screen's plane, the v at which the screen begins and ends, and whether it is dark at its top or bottom.
+    strips: PictureStrips, light: Float32Array, grid: Grid, n_columns: int, aspect: float
+) -> tuple[ScreenAxis, tuple[float, float], bool]:
+    """The coordinate along the columns; where the screen begins and ends; whether it is dark at its top or bottom.
 
     Args:
         strips: of the picture.
@@ -94,13 +94,13 @@ def find_rows(
     by_block = np.maximum(light.mean(axis=(1, 2)), 0.0)
     row = float((by_block * strips.raw_y.mean(axis=1)).sum() / max(float(by_block.sum()), TINY)) * strips.width
     row += (strips.height - 1) / 2
-    plane = Plane.through(grid, n_columns, aspect, row)
-    top, bottom = lit_range(*_light_along(strips, light, plane))
+    axis = ScreenAxis.through(grid, n_columns, aspect, row)
+    top, bottom = lit_range(*_light_along(strips, light, axis))
     missing = 1 - (bottom - top)
     if missing > _WHOLE:
-        return plane, (top - missing / 2, bottom + missing / 2), True
+        return axis, (top - missing / 2, bottom + missing / 2), True
     # A slightly too large outline costs less than omitted rows.
-    return plane, (bottom - 1, top + 1), False
+    return axis, (bottom - 1, top + 1), False
 
 
 def lit_range(v: FloatArray, light: FloatArray) -> tuple[float, float]:
@@ -119,21 +119,21 @@ def lit_range(v: FloatArray, light: FloatArray) -> tuple[float, float]:
     return float(v[0] + (start - 0.5) * step), float(v[0] + (end - 0.5) * step)
 
 
-def _light_along(strips: Strips, light: Float32Array, plane: Plane) -> tuple[FloatArray, FloatArray]:
+def _light_along(strips: PictureStrips, light: Float32Array, axis: ScreenAxis) -> tuple[FloatArray, FloatArray]:
     """Light of the columns along the screen: (n,) v, and (n,) the light there.
 
     The strips of a column lie at the same position along the screen and are averaged.
     """
-    u = columns_at(plane.grid.numbers, strips.x, strips.y)
+    u = columns_at(axis.grid.coefficients, strips.x, strips.y)
     n_blocks, n_strips, n_rows = light.shape
     n = max(int(n_strips / max(float(np.ptp(u, axis=1).mean()), 1.0)), 1)
     whole = n_strips // n * n
     together = light[:, :whole].reshape(n_blocks, -1, n, n_rows).mean(axis=2)
     u, x, y = (values[:, :whole].reshape(n_blocks, -1, n).mean(axis=2) for values in (u, strips.x, strips.y))
-    inside = (u > 0) & (u < plane.n_columns)
+    inside = (u > 0) & (u < axis.n_columns)
     # A strip's rows of one window lie evenly along the screen.
-    radial = plane.grid.numbers[5]
-    ends = [plane.along(*straightened(radial, x[inside], y[inside] + side * strips.half_height)) for side in (-1, 1)]
+    radial = axis.grid.coefficients[5]
+    ends = [axis.along(*straightened(radial, x[inside], y[inside] + side * strips.half_height)) for side in (-1, 1)]
     v = ends[0][:, None] + (ends[1] - ends[0])[:, None] * (np.arange(n_rows) + 0.5) / n_rows
     extent = 1 + 2 * _BEYOND
     # One bin more at either end takes what lies beyond.

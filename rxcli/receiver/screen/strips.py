@@ -35,17 +35,17 @@ LONG_ROWS = 8
 #: Share of a strip's power that may be due to rounding.
 _ROUNDING = 1e-6
 #: Arrays by block and strip.
-_OF_STRIPS = ("changes", "lit", "level", "darkest", "raw_x", "raw_y", "x", "y")
+_OF_STRIPS = ("changes", "coherence", "level", "darkest", "raw_x", "raw_y", "x", "y")
 
 
 @dataclass(frozen=True, slots=True)
-class Strips:
+class PictureStrips:
     """B blocks of S strips of a picture, B = windows of rows x parts of the width, the windows of one part together."""
 
     #: (B, S, R) float32: band-passed light of mean square one along the rows, row noise removed.
     changes: Float32Array
     #: (B, S) float32: coherence of each strip's neighbours, 0..1, the share of its variance that is the columns'.
-    lit: Float32Array
+    coherence: Float32Array
     #: (B, S) float32: mean light, as encoded pixel values.
     level: Float32Array
     #: (B, S) float32: light at the darkest instant, roughly linear, of white.
@@ -86,30 +86,30 @@ class Strips:
         """Distance of two neighbouring strips, picture widths."""
         return float(self.raw_x[0, 1] - self.raw_x[0, 0])
 
-    def coherence(self, distance: int) -> Float32Array:
+    def coherence_at(self, distance: int) -> Float32Array:
         """(B, S - distance) coherence of strips with those `distance` strips to their right."""
         pairs = np.einsum("bsr,bsr->bs", self.changes[:, :-distance], self.changes[:, distance:])
         return np.asarray(pairs / np.float32(self.changes.shape[2]), np.float32)
 
-    def without_common_light(self) -> Strips:
+    def without_common_light(self) -> PictureStrips:
         """The same without the light that all columns share, as of headers and lamps: it shows no borders."""
-        changes = _without(self.changes, np.einsum("bsr,bs->br", self.changes, self.lit))
+        changes = _without(self.changes, np.einsum("bsr,bs->br", self.changes, self.coherence))
         left = _power(changes)
         changes /= np.sqrt(left + np.float32(_ROUNDING))[..., None]
         lit = _lit(changes) * left
-        return replace(self, changes=changes, lit=lit, n_rows=_independent_rows(changes, lit))
+        return replace(self, changes=changes, coherence=lit, n_rows=_independent_rows(changes, lit))
 
-    def blocks(self, chosen: Any) -> Strips:
+    def blocks(self, chosen: Any) -> PictureStrips:
         """Some of the blocks, or of their strips, by an index of the first axis or of the first two."""
         return replace(self, **{name: getattr(self, name)[chosen] for name in _OF_STRIPS})
 
-    def part(self, number: int) -> Strips:
+    def part(self, number: int) -> PictureStrips:
         """The blocks of one part of the width."""
         return self.blocks(slice(number * self.n_windows, (number + 1) * self.n_windows))
 
-    def sides_of_gap(self) -> list[Strips]:
+    def sides_of_gap(self) -> list[PictureStrips]:
         """The strips on either side of the widest gap without coherent light, the gap in both; none without a gap."""
-        lit = self.lit.mean(axis=0)
+        lit = self.coherence.mean(axis=0)
         share = np.cumsum(lit) / (lit.sum() + np.float32(TINY))
         is_dark = lit < _GAP_LIGHT * np.quantile(lit, 0.9)
         is_dark[(share < _MIN_APART) | (share > 1 - _MIN_APART)] = False
@@ -120,7 +120,7 @@ class Strips:
         return [self.blocks(np.s_[:, :end]), self.blocks(np.s_[:, start:])]
 
 
-def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1) -> Strips:
+def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1) -> PictureStrips:
     """Strips of a picture, from its plane.
 
     Args:
@@ -146,7 +146,7 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
     by_window = means.reshape(x.size, n_windows, rows)
     level, darkest = by_window.mean(axis=2).T, _roughly_linear(plane, by_window.min(axis=2).T)
     of_strips = zip(_OF_STRIPS, (changes, lit, level, darkest, *stored, *flat), strict=True)
-    return Strips(
+    return PictureStrips(
         **{name: parted(values) for name, values in of_strips},
         half_height=rows * short / 2 / plane.width,
         row_noise=noise,
@@ -183,17 +183,17 @@ def flat_places(points: FloatArray, width: int, height: int, lens: Lens | None) 
     return (points[..., 0] - (width - 1) / 2) / width, (points[..., 1] - (height - 1) / 2) / width
 
 
-def shows_narrow_columns(strips: Strips) -> bool:
+def shows_narrow_columns(strips: PictureStrips) -> bool:
     """Whether strips are coherent at a short distance only; with wide columns they stay coherent further on."""
     near, far = (_lit_coherence(strips, widths) for widths in (_NEAR_WIDTHS, _FAR_WIDTHS))
     return far < _NARROW_RATIO * near
 
 
-def _lit_coherence(strips: Strips, widths: float) -> float:
+def _lit_coherence(strips: PictureStrips, widths: float) -> float:
     """Mean coherence of lit strips `widths` picture widths apart, relative to that within one column."""
     distance = max(round(widths / strips.step), 1)
-    share = np.sqrt(strips.lit[:, :-distance] * strips.lit[:, distance:])
-    return float((strips.coherence(distance) * share).sum() / (np.square(share).sum() + TINY))
+    share = np.sqrt(strips.coherence[:, :-distance] * strips.coherence[:, distance:])
+    return float((strips.coherence_at(distance) * share).sum() / (np.square(share).sum() + TINY))
 
 
 def _means_of_rows(light: Float32Array, short: int, n_windows: int) -> Float32Array:

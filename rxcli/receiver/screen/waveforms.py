@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_slopes, grid_step
-from rxcli.receiver.screen.strips import Strips
+from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
 #: Ridge regularisation of the waveforms of faint columns, in strips.
@@ -68,9 +68,9 @@ def _dot(left: Float32Array, right: Float32Array) -> Float32Array:
     return np.asarray(np.einsum("bsk,bsk->bs", left, right), np.float32)
 
 
-def _halves(strips: Strips, mixes: Mixes) -> Iterator[tuple[slice, Float32Array]]:
+def _halves(strips: PictureStrips, mixes: Mixes) -> Iterator[tuple[slice, Float32Array]]:
     """The odd strips, with the waveforms (B, K, R) of the columns estimated from the even ones; and vice versa."""
-    weighted = mixes.share * np.sqrt(strips.lit)[..., None]
+    weighted = mixes.share * np.sqrt(strips.coherence)[..., None]
     turned = weighted.transpose(0, 2, 1)
     # Neighbouring strips have nearly the same mix, so half the normal matrix serves either half of them.
     normal = np.matmul(turned, weighted) / 2 + np.float32(_RIDGE) * np.eye(len(turned[0]), dtype=np.float32)
@@ -98,7 +98,7 @@ class _Predicted:
         return cls(np.matmul(waves, turned), np.matmul(changes, turned), _dot(changes, changes))
 
 
-def predicted_light(strips: Strips, u: FloatArray, sigma: float) -> Float32Array:
+def predicted_light(strips: PictureStrips, u: FloatArray, sigma: float) -> Float32Array:
     """(B, S, R) products of each strip's changes with their prediction by the other half, at columns (B, S)."""
     out, mixes = np.empty_like(strips.changes), Mixes.of(u, sigma)
     for half, waves in _halves(strips, mixes):
@@ -106,7 +106,7 @@ def predicted_light(strips: Strips, u: FloatArray, sigma: float) -> Float32Array
     return out
 
 
-def explained_light(strips: Strips, u: FloatArray, sigma: float) -> float:
+def explained_light(strips: PictureStrips, u: FloatArray, sigma: float) -> float:
     """Log-likelihood gain of strips at columns (B, S) from their prediction by the other half of the strips."""
     total, mixes = 0.0, Mixes.of(u, sigma)
     for half, waves in _halves(strips, mixes):
@@ -117,15 +117,15 @@ def explained_light(strips: Strips, u: FloatArray, sigma: float) -> float:
     return total
 
 
-def with_light(strips: Strips, grid: Grid, sigma: float) -> Grid:
+def with_light(strips: PictureStrips, grid: Grid, sigma: float) -> Grid:
     """Add to a grid the strips' light that it explains, and the excess over the same half a column further on."""
-    u = columns_at(grid.numbers, strips.x, strips.y)
+    u = columns_at(grid.coefficients, strips.x, strips.y)
     here, between = explained_light(strips, u, sigma), explained_light(strips, u + 0.5, sigma)
     return replace(grid, explained=here, contrast=here - between)
 
 
 def moved_by_waveforms(
-    strips: Strips,
+    strips: PictureStrips,
     grid: Grid,
     sigma: float,
     n_steps: int,
@@ -142,19 +142,19 @@ def moved_by_waveforms(
         within: (B, S) strips to use; all by default.
         n_columns: of the screen, if the grid is numbered from its first column: light beyond is not from a column.
     """
-    numbers = grid.numbers
+    coefficients = grid.coefficients
     for _ in range(n_steps):
-        off, weight = _offsets(strips, Mixes.of(columns_at(numbers, strips.x, strips.y), sigma, n_columns))
+        off, weight = _offsets(strips, Mixes.of(columns_at(coefficients, strips.x, strips.y), sigma, n_columns))
         if within is not None:
             weight = weight * within
         if not weight.any():
             break  # A black picture has no borders.
-        slopes = grid_slopes(numbers, strips.x, strips.y).reshape(numbers.size, -1)
-        numbers = numbers + grid_step(numbers, _STEP_GAIN * off.ravel(), weight.ravel(), slopes)
-    return replace(grid, numbers=numbers)
+        slopes = grid_slopes(coefficients, strips.x, strips.y).reshape(coefficients.size, -1)
+        coefficients = coefficients + grid_step(coefficients, _STEP_GAIN * off.ravel(), weight.ravel(), slopes)
+    return replace(grid, coefficients=coefficients)
 
 
-def _offsets(strips: Strips, mixes: Mixes) -> tuple[FloatArray, FloatArray]:
+def _offsets(strips: PictureStrips, mixes: Mixes) -> tuple[FloatArray, FloatArray]:
     """(B, S) offset of each strip from its position in a grid, columns, and the precision of the offset."""
     off, precision, slope = np.zeros(strips.x.shape), np.zeros(strips.x.shape), mixes.slopes()
     for half, waves in _halves(strips, mixes):

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, match_camera
-from rxcli.receiver.camera import CameraHypothesis, Strips, lens_of, propose, strips_of, summary, why_not
+from rxcli.receiver.camera import CameraHypothesis, ColumnStrips, lens_of, propose, strips_of, summary, why_not
 from rxcli.receiver.camera import settle as settle_hypothesis
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
@@ -121,7 +121,7 @@ def settle(context: FrameContext, acquisition: Acquisition, reception: Reception
     return estimated_camera(found, screen.slot_rate_hz, frame), moved_slots
 
 
-def _strips(context: FrameContext, profiles: RowProfiles) -> Strips:
+def _strips(context: FrameContext, profiles: RowProfiles) -> ColumnStrips:
     """Convert row profiles to strips in order of time."""
     frame, outlines = context.frame, context.outlines(len(profiles.light))
     x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2

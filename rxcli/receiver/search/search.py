@@ -16,6 +16,7 @@ from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.screen.find import ColumnLayout
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
@@ -105,10 +106,8 @@ def _corners_by_slots(outline: Outline, best: Scored) -> FloatArray:
     if outline.strips is None or best.evidence < SETTINGS.plain:
         return outline.corners
     return corners_by_slots(
-        outline.strips,
-        outline.corners,
-        screen.aspect,
-        screen.light_spread,
+        outline,
+        ColumnLayout(screen.columns, screen.light_spread, screen.aspect),
         reception.clock,
         reception.clock.on_grid(reception.posteriors.lit),
         context.camera.lens or outline.lens,

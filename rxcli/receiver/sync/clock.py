@@ -141,7 +141,7 @@ def contrast(
     return value.sum(axis=1) / (total + np.float32(TINY)), total
 
 
-def header_contrast(light: Float32Array, valid: Float32Array, min_sigma: float) -> tuple[Float32Array, Float32Array]:
+def search_contrast(light: Float32Array, valid: Float32Array, min_sigma: float) -> tuple[Float32Array, Float32Array]:
     """As `contrast`, for the search for headers: faint strips count less, and noise is at least that of dark samples.
 
     Row noise is common to the pixels of a strip, so that their variance does not show it.
@@ -185,7 +185,7 @@ def find_clock(
     if n < SLOTS_PER_SYMBOL * SETTINGS.search_samples:
         return None
     light, valid = resample(profiles, top, step, n)
-    pooled, weight = header_contrast(light, valid, sigma / np.sqrt(max(step, 1.0)))
+    pooled, weight = search_contrast(light, valid, sigma / np.sqrt(max(step, 1.0)))
     response = header_response(pooled, weight, SETTINGS.search_samples)
     period = packet_slots * SETTINGS.search_samples
     power = folded(np.maximum(response.mean(axis=0), 0) ** 2, period)

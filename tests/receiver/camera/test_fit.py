@@ -19,7 +19,7 @@ BEND = np.array([-0.22, 0.1, 4e-4, -3e-4])
 SPREAD = 0.1
 
 
-def _strips(rng: np.random.Generator, curvature: FloatArray) -> tuple[blind.Strips, FloatArray]:
+def _strips(rng: np.random.Generator, curvature: FloatArray) -> tuple[blind.ColumnStrips, FloatArray]:
     """Strips of a textured picture whose sensor rows are bent, and the slots (C, N) that they show."""
     bits = [rng.integers(0, 2, payload_bits(w, 11), dtype=np.uint8) for w in rng.integers(3, 8, COLUMNS)]
     lit = np.stack([np.tile(encode_packet(b, _weight(b)), 3)[:300] for b in bits]).astype(np.float64)
@@ -37,7 +37,7 @@ def _strips(rng: np.random.Generator, curvature: FloatArray) -> tuple[blind.Stri
         light += lit[np.arange(n)[:, None] // 4, slot] / 40
     picture = 0.2 * np.exp(np.cumsum(rng.normal(0, 0.01, (n, ROWS)), axis=1))
     light = picture * light + rng.normal(0, 0.003, light.shape)
-    strips = blind.Strips(
+    strips = blind.ColumnStrips(
         light=light.astype(np.float32),
         inside=np.ones(light.shape, np.float32),
         x=x,
@@ -73,7 +73,7 @@ def _as_stored(curvature: FloatArray, reverse: bool) -> FloatArray:
 
 
 def _settled(
-    strips: blind.Strips, first: blind.CameraHypothesis, lit: FloatArray
+    strips: blind.ColumnStrips, first: blind.CameraHypothesis, lit: FloatArray
 ) -> tuple[blind.CameraHypothesis, float]:
     return blind.settle(strips, first, _clock(first), lit.astype(np.float32), SPREAD)
 

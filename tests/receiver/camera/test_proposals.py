@@ -68,7 +68,7 @@ def phone(
     return Frame(pixels, "phone"), corners, truth
 
 
-def strips_of(frame: Frame, corners: FloatArray, n_columns: int = 20) -> blind.Strips:
+def strips_of(frame: Frame, corners: FloatArray, n_columns: int = 20) -> blind.ColumnStrips:
     """Strips of a frame as the pipeline makes them."""
     column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
     n_strips = plane.strips_per_column(column_px)
@@ -183,9 +183,9 @@ def test_an_estimate_can_be_kept_as_a_profile() -> None:
     np.testing.assert_allclose(geometry.distort(points, kept), geometry.distort(points, lens))
 
 
-def _flat_strips(light: FloatArray) -> blind.Strips:
+def _flat_strips(light: FloatArray) -> blind.ColumnStrips:
     n_rows = light.shape[1]
-    return blind.Strips(
+    return blind.ColumnStrips(
         light=light.astype(np.float32),
         inside=np.ones(light.shape, np.float32),
         x=np.broadcast_to(np.linspace(10, 790, light.shape[0])[:, None], light.shape),

@@ -81,7 +81,8 @@ def results_of(
     features = confidence.confidence_features(posteriors, margin, np.zeros(len(snr), bool), samples.light.shape[1])
     headerless = assemble.find_headerless(posteriors.header_llr)
     n_observed = assemble.slots_observed(samples, clock)
-    return assemble.column_results(clock, posteriors, snr, n_observed, features, headerless, min_confidence)
+    frame = assemble.FrameColumns(clock, snr, headerless, min_confidence)
+    return assemble.column_results(frame, posteriors, n_observed, features)
 
 
 def test_a_sure_packet() -> None:
@@ -316,7 +317,9 @@ def test_a_packet_of_a_clip_that_misses_a_slot_is_not_whole() -> None:
     n_observed[0, 30] = 0
     posteriors = posteriors_of([5, 5], indices([5, 5]))
     burst = confidence.BurstInClip(0, 0, posteriors, n_observed, (3,), None, np.zeros(2, np.float32))
-    first, second = assemble.clip_results(clock, [burst], lambda _: False, snr(60), np.zeros(2, bool), 0.0)
+    first, second = assemble.clip_results(
+        assemble.FrameColumns(clock, snr(60), np.zeros(2, bool), 0.0), [burst], lambda _: False
+    )
     assert not first.packets
     assert "of 50 slots 1 are missing" in (first.message or "")
     assert second.packets

@@ -207,7 +207,7 @@ def test_a_lens_that_is_known_is_taken_off() -> None:
 
 def test_columns_that_a_lens_bends_are_read_through_it() -> None:
     straight = grid_between(CORNERS, 100, (WIDTH, HEIGHT), None)
-    grid = replace(straight, numbers=straight.numbers + np.array([0, 0, 0, 0, 0, 0.04]))
+    grid = replace(straight, coefficients=straight.coefficients + np.array([0, 0, 0, 0, 0, 0.04]))
     corners, lens = grid.pixels_of(np.stack(straight.flat(CORNERS), axis=-1)), grid.estimated_lens
     assert lens is not None
     u, v = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 7), indexing="ij")
@@ -229,7 +229,9 @@ def test_decided_slots_move_the_columns_to_their_place(is_turned: bool) -> None:
     lit = sent[:, 3:23].T
     if is_turned:  # Corners and columns are a viewer's, who sees the stored picture upside down.
         before, lit = before[[2, 3, 0, 1]], lit[::-1]
-    corners = corners_by_slots(strips, before, 16 / 9, 0.47, clock, np.ascontiguousarray(lit), None)
+    corners = corners_by_slots(
+        Outline(before, strips=strips), ColumnLayout(20, 0.47), clock, np.ascontiguousarray(lit), None
+    )
     corners = corners[[2, 3, 0, 1]] if is_turned else corners
     off = (corners - CORNERS) @ along / (along @ along)
     assert np.abs(off).max() < 0.1
@@ -256,11 +258,13 @@ def test_the_true_grid_explains_more_than_others_and_is_reached_from_near() -> N
     own = with_light(strips, true, 0.45)
     for factor in (0.8, 0.95, 1.05, 1.3):
         other = with_light(
-            strips, replace(true, numbers=true.numbers * np.array([factor, factor, factor, 1, 1, 1])), 0.45
+            strips, replace(true, coefficients=true.coefficients * np.array([factor, factor, factor, 1, 1, 1])), 0.45
         )
         assert other.explained + 3 * other.contrast < own.explained + 3 * own.contrast
-    near = replace(true, numbers=true.numbers * np.array([1, 1.015, 1, 1, 1, 1]) + np.array([0.1, 0, 0.2, 0, 0, 0]))
-    off = moved_by_waveforms(strips, near, 0.45, 8).numbers[:3] - true.numbers[:3]
+    near = replace(
+        true, coefficients=true.coefficients * np.array([1, 1.015, 1, 1, 1, 1]) + np.array([0.1, 0, 0.2, 0, 0, 0])
+    )
+    off = moved_by_waveforms(strips, near, 0.45, 8).coefficients[:3] - true.coefficients[:3]
     assert np.abs(off).max() < 0.3
 
 
@@ -269,7 +273,7 @@ def test_a_rival_replaces_missing_combs_where_borders_show(monkeypatch: pytest.M
     strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
     x, y = strips.x, strips.y
     (reached,) = wide_grids(strips, 0.45, [true.shifted(0.2)])
-    assert np.abs(columns_at(reached.numbers, x, y) - columns_at(true.numbers, x, y)).max() < 0.3
+    assert np.abs(columns_at(reached.coefficients, x, y) - columns_at(true.coefficients, x, y)).max() < 0.3
     assert not wide_grids(strips, 0.45, [true.shifted(0.5)])
 
 
@@ -290,7 +294,7 @@ def test_a_second_grid_is_proposed_where_it_does_nearly_as_well(monkeypatch: pyt
 
 def profile_of(picture: str) -> LightProfile:
     strips, grid = read_strips(drawn(picture)), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
-    return light_profile(strips, predicted_light(strips, columns_at(grid.numbers, strips.x, strips.y), 0.45), grid)
+    return light_profile(strips, predicted_light(strips, columns_at(grid.coefficients, strips.x, strips.y), 0.45), grid)
 
 
 def test_columns_with_light_are_told_from_those_without() -> None:
@@ -362,7 +366,7 @@ def test_likeness_is_the_mean_cosine_of_two_places_light(distance: float) -> Non
 def test_coherence_of_independent_strips_is_chance() -> None:
     luma = np.clip(100 + np.random.default_rng(4).normal(0, 10, (HEIGHT, WIDTH)), 0, 255).astype(np.uint8)
     strips = read_strips(plane_of(luma))
-    pairs = strips.coherence(7)
+    pairs = strips.coherence_at(7)
     assert abs(float(pairs.mean())) < 0.01
     assert float(pairs.std()) == pytest.approx(strips.n_rows**-0.5, rel=0.3)
     assert not [comb for comb in find_combs(strips, 0.45) if comb.score > 7]

@@ -17,7 +17,7 @@ from rxcli.types import BoolArray, FloatArray, Frame
 
 
 @dataclass(slots=True, eq=False)
-class Link:
+class Timeline:
     """The link's time, as long as it is not lost, and the bursts that it counts."""
 
     time: tracking.LinkTime
@@ -36,13 +36,13 @@ class Link:
     header_llr: FloatArray | float = 0.0
 
     @classmethod
-    def begin(cls, view: View, start: Start | None, stretch: float) -> Link:
+    def begin(cls, view: View, start: Start | None, stretch: float) -> Timeline:
         """Begin with a frame; its time is that of `start` if the first frames agreed on one."""
         screen = view.acquisition.screen
         time = start.time if start else tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
         return cls(time, tracking.BurstPhase(view.acquisition.repeats), _shape(view), stamps_judged=stretch != 1)
 
-    def after(self, before: Link, frame: Frame) -> Link:
+    def after(self, before: Timeline, frame: Frame) -> Timeline:
         """Count on from an earlier time, with the bursts that passed until a frame."""
         passed_s = (frame.time_s - before.last_time_s) / self.time.stretch
         passed = int(passed_s * self.time.slot_rate_hz / (self.time.packet_slots * before.phase.repeats))
