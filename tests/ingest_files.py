@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import struct
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import av
+import cv2
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
@@ -20,6 +23,8 @@ XTRANS = np.array(["GGRGGB", "GGBGGR", "BRGRBG", "GGBGGR", "GGRGGB", "RBGBRG"])
 XTRANS = np.array([["RGB".index(colour) for colour in row] for row in XTRANS], np.uint8)
 #: Size, length and rate of the clips.
 HEIGHT, WIDTH, N_FRAMES, RATE = 96, 160, 24, 30
+#: Pixel formats of codecs whose sizes may change.
+FORMS = {"mjpeg": "yuvj420p", "libvpx-vp9": "yuv420p"}
 QUIET = {"libx265": {"x265-params": "log-level=none"}}
 
 
@@ -67,6 +72,43 @@ def write_clip(path: Path, codec: str = "libx264", form: str = "yuv420p", **opti
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return planes
+
+
+def riff_chunk(name: bytes, data: bytes) -> bytes:
+    """A chunk of an AVI file."""
+    return name + struct.pack("<I", len(data)) + data
+
+
+def write_palette_clip(path: Path, planes: list[NDArray[Any]], is_bottom_up: bool = True) -> None:
+    """Write an uncompressed AVI of 8 bits a pixel, with grey levels in no order."""
+    palette = np.random.default_rng(3).permutation(256).astype(np.uint8)
+    index, (rows, width) = np.argsort(palette).astype(np.uint8), planes[0].shape
+    body = b"".join(riff_chunk(b"00db", index[p[::-1] if is_bottom_up else p].tobytes()) for p in planes)
+    height = rows if is_bottom_up else -rows
+    form = struct.pack("<IiiHHIIiiII", 40, width, height, 1, 8, 0, width * rows, 0, 0, 256, 0)
+    form += np.stack([palette, palette, palette, palette * 0], axis=1).tobytes()
+    counts = (0, 0, 0, 0, 1, RATE, 0, len(planes), width * rows, 0, 0)
+    header = struct.pack("<4s4s11I4H", b"vids", b"DIB ", *counts, 0, 0, width, rows)
+    stream = riff_chunk(b"LIST", b"strl" + riff_chunk(b"strh", header) + riff_chunk(b"strf", form))
+    main = struct.pack("<14I", 1_000_000 // RATE, 0, 0, 0, len(planes), 0, 1, 0, width, rows, 0, 0, 0, 0)
+    lists = riff_chunk(b"LIST", b"hdrl" + riff_chunk(b"avih", main) + stream) + riff_chunk(b"LIST", b"movi" + body)
+    path.write_bytes(riff_chunk(b"RIFF", b"AVI " + lists))
+
+
+def write_sizes(path: Path, codec: str, sizes: list[tuple[int, int]], picture: NDArray[np.uint8]) -> None:
+    """A clip that shows a picture (height, width, 3) in one frame of each size (width, height)."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=RATE)
+        (stream.width, stream.height), stream.pix_fmt = sizes[0], FORMS[codec]
+        for number, (width, height) in enumerate(sizes):
+            encoder = av.CodecContext.create(codec, "w")
+            encoder.width, encoder.height, encoder.pix_fmt = width, height, FORMS[codec]
+            encoder.framerate, encoder.time_base = RATE, Fraction(1, RATE)
+            pixels = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
+            frame = av.VideoFrame.from_ndarray(pixels, "rgb24").reformat(format=FORMS[codec])
+            for packet in (*encoder.encode(frame), *encoder.encode()):
+                packet.stream, packet.pts, packet.dts, packet.time_base = stream, number, number, Fraction(1, RATE)
+                container.mux(packet)
 
 
 def _fill(frame: av.VideoFrame, luma: NDArray[Any]) -> NDArray[Any]:

@@ -33,7 +33,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from ingest_files import BAYER, write_dng
+from ingest_files import BAYER, write_dng, write_palette_clip, write_sizes
 from numpy.typing import NDArray
 from odd_stills import odd_jpegs, odd_pngs, odd_tiffs
 from small_frames import write_frame, write_profiles
@@ -217,6 +217,9 @@ def _write_clips(folder: Path, picture: NDArray[np.uint8]) -> None:
                 frame = av.VideoFrame.from_ndarray(frame_rgb, "rgb24").reformat(format=stream.pix_fmt)
                 container.mux(stream.encode(frame))
             container.mux(stream.encode())
+    write_palette_clip(folder / "palette.avi", [frame_rgb[..., 1]] * 3)
+    for name, codec in (("sizes.avi", "mjpeg"), ("sizes.webm", "libvpx-vp9")):
+        write_sizes(folder / name, codec, [(width, height), (width // 2, height // 2), (width, height)], frame_rgb)
 
 
 class Cases:

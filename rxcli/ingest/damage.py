@@ -71,24 +71,22 @@ class WholeFrames:
             self._n_sent += 1
         try:
             for frame in self._codec.decode(packet):
-                self._enter(frame)
+                self._enter(frame.opaque, frame)
         except av.error.FFmpegError:  # of a packet that gives no frame; HEVC's do
-            if self._codec.name == "hevc":
-                for picture in self._sent:
-                    picture.is_damaged |= picture.number == self._n_sent - self._n_threads
+            for picture in self._sent if self._codec.name == "hevc" else ():
+                picture.is_damaged |= picture.number == self._n_sent - self._n_threads
         yield from self._judge(is_end=packet is None)
         while self._shown and (self._shown[0][0].is_whole is not None or len(self._shown) > self._max_held):
             picture, frame = self._shown.popleft()
             yield None if picture.is_whole is False else frame
 
-    def _enter(self, frame: Any) -> None:
-        picture = frame.opaque
+    def _enter(self, picture: _Picture, frame: Any) -> None:
         picture.is_key, picture.place = frame.key_frame, self._n_shown
         picture.is_damaged |= frame.is_corrupt
         self._n_shown += 1
         self._newest = max(self._newest, picture.number)
         self._is_interlaced |= frame.interlaced_frame
-        if self._first < 0 and frame.key_frame:
+        if self._first < 0 and picture.is_key:
             self._first = picture.number
         if self._first >= 0:  # else of a clip that begins between two key frames
             self._shown.append((picture, frame))

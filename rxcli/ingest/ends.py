@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 _TS_SYNC = 0x47
@@ -11,7 +10,7 @@ _EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
 
 
 def is_cut(path: Path, container: str) -> bool:
-    """Whether a file ends before the last of its outermost parts does.
+    """Whether a file ends within one of its outermost parts; what is behind the last of them is no part of a clip.
 
     Args:
         path: the file.
@@ -19,20 +18,12 @@ def is_cut(path: Path, container: str) -> bool:
     """
     if container == "mpegts":
         return _ends_within_packet(path)
-    size_of = next((size_of for name, size_of in _SIZES.items() if name in container), None)
-    return size_of is not None and _ends_within_part(path, size_of)
-
-
-def _ends_within_part(path: Path, size_of: Callable[[bytes], int]) -> bool:
-    """Whether a file ends within one of its outermost parts; what is behind the last of them is no part of a clip."""
+    size_of = _box if "mp4" in container else _element
     part, length = 0, path.stat().st_size
     with path.open("rb") as file:
-        while part < length:
-            file.seek(part)
-            size = size_of(file.read(16))
-            if size == 0:
-                return False
+        while part < length and (size := size_of(file.read(16))):
             part += size
+            file.seek(min(part, length))
     return part > length
 
 
@@ -43,12 +34,6 @@ def _box(head: bytes) -> int:
     return size if size >= 8 and head[4:8].isalnum() else 0
 
 
-def _riff(head: bytes) -> int:
-    """Size of a RIFF chunk, as AVI files have one or several of; 0 where the recorder did not come to fill it in."""
-    size = int.from_bytes(head[4:8], "little")
-    return 8 + size if head.startswith(b"RIFF") and size else 0
-
-
 def _element(head: bytes) -> int:
     """Size of an outermost element of Matroska (RFC 8794, sections 4 and 6); 0 where it is not known."""
     if not head.startswith((_EBML, _SEGMENT)) or len(head) < 16:
@@ -56,10 +41,6 @@ def _element(head: bytes) -> int:
     length = 9 - head[4].bit_length()
     size = int.from_bytes(head[4 : 4 + length]) & (1 << 7 * length) - 1
     return 4 + length + size if size + 1 < 1 << 7 * length else 0
-
-
-#: By what FFmpeg calls them.
-_SIZES = {"mp4": _box, "avi": _riff, "matroska": _element}
 
 
 def _ends_within_packet(path: Path) -> bool:

@@ -35,8 +35,6 @@ _LIMITED_BLACK, _LIMITED_WHITE = 16, 235
 _LOWER_FIRST = (3, 4)
 #: Columns whose rows are compared to see whether a frame is two fields.
 _N_COMPARED = 64
-#: Of what a clip states, so much may be missing at its end, in frames; times are rounded.
-_END_TOLERANCE = 1.5
 #: Frame rates that a stream may state, and the one that is taken where it states none.
 _RATES_HZ, _USUAL_RATE_HZ = (1.0, 1000.0), 30.0
 #: Pictures of MJPEG that are decoded or wait at most, one in each thread and as many before it.
@@ -67,8 +65,6 @@ class _Progress:
 
     times: FrameTimes = field(default_factory=FrameTimes)
     last_time_s: float = 0.0
-    #: Where the last packet ends that the container gave.
-    end_s: float = 0.0
     #: Time of the last whole frame before the first fault.
     broken_at_s: float | None = None
     n_damaged: int = 0
@@ -152,39 +148,28 @@ def _frames(path: Path, container: Any, stream: Any, progress: _Progress) -> Ite
 def _packets(container: Any, stream: Any, progress: _Progress) -> Iterator[tuple[Any, bool]]:
     """Packets with content, and whether some of it is lost; then None, which asks the decoder for its last frames."""
     before, has_gap = None, False
-    is_parsed = container.format.name == "mpegts"
     for packet in _content(container, stream, progress):
         if before is not None:
-            yield before, has_gap and not _is_joint(before, packet)
+            times = (before.dts, packet.dts)
+            is_joint = None not in times and not 0 <= (times[1] - times[0]) * packet.time_base <= _JOINT_S
+            yield before, has_gap and not is_joint
         # A parser ends a packet where it finds the next one, and flags the packet before the one that has the gap.
-        has_gap = before is not None and before.is_corrupt if is_parsed else packet.is_corrupt
-        before = packet
-    progress.cut |= has_gap
+        flagged = before if container.format.name == "mpegts" else packet
+        before, has_gap = packet, flagged is not None and flagged.is_corrupt
     if before is not None:
+        progress.cut |= has_gap
         yield before, has_gap
     yield None, False
 
 
 def _content(container: Any, stream: Any, progress: _Progress) -> Iterator[Any]:
-    """Packets with content up to the end or a fault."""
+    """Packets up to the end or a fault, but for empty ones, which stand for frames that a camera dropped."""
     import av
 
     try:
-        for packet in container.demux(stream):
-            if packet.size:  # a camera that drops a frame writes an empty one
-                if packet.pts is not None:
-                    end_s = float((packet.pts + (packet.duration or 0)) * packet.time_base)
-                    progress.end_s = max(progress.end_s, end_s)
-                yield packet
+        yield from (packet for packet in container.demux(stream) if packet.size)
     except av.error.FFmpegError:
         progress.cut = True
-
-
-def _is_joint(before: Any, packet: Any) -> bool:
-    """Whether a packet begins another clip, which was joined to that of the packet before."""
-    if before.dts is None or packet.dts is None:
-        return False
-    return not 0 <= (packet.dts - before.dts) * packet.time_base <= _JOINT_S
 
 
 def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
@@ -303,24 +288,16 @@ def _plane(plane: Any, width: int, height: int, dtype: type[np.uint8] | type[np.
 
 def _check_whole(path: Path, container: Any, stream: Any, progress: _Progress) -> None:
     """Raise where the clip ended before it should, or frames of it were left out."""
-    if progress.cut or is_cut(path, container.format.name) or _ends_early(container, stream, progress):
+    indexed = stream.index_entries if "mp4" in container.format.name else ()
+    lacks_samples = any(entry.pos + entry.size > container.size for entry in indexed)
+    if progress.cut or lacks_samples or is_cut(path, container.format.name):
         reason = f"{path}: the clip breaks off at {progress.last_time_s:.3f} s"
         raise InputError(reason, "the frames before were read; copy the file from the camera again")
     if progress.n_damaged:
-        after = "" if progress.broken_at_s is None else f", the first after {progress.broken_at_s:.3f} s"
-        reason = f" ({progress.reason})" if progress.reason else ""
-        raise InputError(f"{path}: {progress.n_damaged} frames are damaged{after}{reason}", "copy the file again")
-
-
-def _ends_early(container: Any, stream: Any, progress: _Progress) -> bool:
-    """Whether samples of the index, or the stated duration where no sizes are stated, ask for more than there was."""
-    name = container.format.name
-    if "mp4" in name:
-        return any(entry.pos + entry.size > container.size for entry in stream.index_entries)
-    if stream.duration is None or any(known in name for known in ("avi", "mpegts", "matroska")):
-        return False
-    frame_s, stated_end_s = _frame_s(stream), float(stream.duration * stream.time_base)
-    return progress.end_s + _END_TOLERANCE * frame_s < stated_end_s < _MAX_S
+        reason = f", the first after {progress.broken_at_s:.3f} s" + (
+            f" ({progress.reason})" if progress.reason else ""
+        )
+        raise InputError(f"{path}: {progress.n_damaged} frames are damaged{reason}", "copy the file again")
 
 
 def _open_failure(path: Path, error: Exception) -> tuple[str, str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Callable
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,13 @@ import numpy as np
 import pytest
 import simplejpeg
 from av.stream import Disposition
-from ingest_files import HEIGHT, N_FRAMES, RATE, WIDTH, read_all, write_clip
+from ingest_files import HEIGHT, N_FRAMES, RATE, WIDTH, read_all, write_clip, write_palette_clip, write_sizes
 from numpy.typing import NDArray
 
 from rxcli.ingest import video
 from rxcli.ingest.times import FrameTimes
 
 Planes = list[NDArray[Any]]
-FORMS = {"mjpeg": "yuvj420p", "libvpx-vp9": "yuv420p"}
 
 
 def changed(path: Path, change: Callable[[bytes], bytes]) -> None:
@@ -86,24 +84,9 @@ def pictures(n_frames: int = N_FRAMES, height: int = HEIGHT, width: int = WIDTH)
     return list(rng.integers(16, 236, shape, dtype=np.uint8).repeat(8, 1).repeat(width, 2))
 
 
-def chunk(name: bytes, data: bytes) -> bytes:
-    return name + struct.pack("<I", len(data)) + data
-
-
 def with_palette(path: Path, is_bottom_up: bool) -> Planes:
-    """Uncompressed, 8 bits a pixel, a palette in no order."""
-    palette = np.random.default_rng(3).permutation(256).astype(np.uint8)
-    planes, index = pictures(), np.argsort(palette).astype(np.uint8)
-    body = b"".join(chunk(b"00db", index[p[::-1] if is_bottom_up else p].tobytes()) for p in planes)
-    height = HEIGHT if is_bottom_up else -HEIGHT
-    form = struct.pack("<IiiHHIIiiII", 40, WIDTH, height, 1, 8, 0, WIDTH * HEIGHT, 0, 0, 256, 0)
-    form += np.stack([palette, palette, palette, palette * 0], axis=1).tobytes()
-    counts = (0, 0, 0, 0, 1, RATE, 0, N_FRAMES, WIDTH * HEIGHT, 0, 0)
-    header = struct.pack("<4s4s11I4H", b"vids", b"DIB ", *counts, 0, 0, WIDTH, HEIGHT)
-    stream = chunk(b"LIST", b"strl" + chunk(b"strh", header) + chunk(b"strf", form))
-    main = struct.pack("<14I", 1_000_000 // RATE, 0, 0, 0, N_FRAMES, 0, 1, 0, WIDTH, HEIGHT, 0, 0, 0, 0)
-    lists = chunk(b"LIST", b"hdrl" + chunk(b"avih", main) + stream) + chunk(b"LIST", b"movi" + body)
-    path.write_bytes(chunk(b"RIFF", b"AVI " + lists))
+    planes = pictures()
+    write_palette_clip(path, planes, is_bottom_up)
     return planes
 
 
@@ -271,24 +254,10 @@ def test_fields_are_frames_where_they_are_two_pictures(tmp_path: Path, lower_fir
     assert any("interlaced" in doubt for doubt in frames[-1].metadata.not_believed) != are_two
 
 
-def of_sizes(path: Path, codec: str, sizes: list[tuple[int, int]]) -> None:
-    """A clip of one frame of each size (width, height)."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=RATE)
-        (stream.width, stream.height), stream.pix_fmt = sizes[0], FORMS[codec]
-        for number, (width, height) in enumerate(sizes):
-            encoder = av.CodecContext.create(codec, "w")
-            encoder.width, encoder.height, encoder.pix_fmt = width, height, FORMS[codec]
-            encoder.framerate, encoder.time_base = RATE, Fraction(1, RATE)
-            for packet in (*encoder.encode(av.VideoFrame(width, height, FORMS[codec])), *encoder.encode()):
-                packet.stream, packet.pts, packet.dts, packet.time_base = stream, number, number, Fraction(1, RATE)
-                container.mux(packet)
-
-
 @pytest.mark.parametrize(("suffix", "codec"), [("avi", "mjpeg"), ("mkv", "mjpeg"), ("webm", "libvpx-vp9")])
 def test_frames_of_changing_size(tmp_path: Path, suffix: str, codec: str) -> None:
     sizes = [(160, 96), (320, 192), (64, 64), (160, 96)]
-    of_sizes(tmp_path / f"a.{suffix}", codec, sizes)
+    write_sizes(tmp_path / f"a.{suffix}", codec, sizes, np.zeros((8, 8, 3), np.uint8))
     frames, error = read_all(tmp_path / f"a.{suffix}")
     assert error is None
     assert [(frame.width, frame.height) for frame in frames] == sizes
