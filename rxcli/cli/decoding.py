@@ -6,7 +6,6 @@ import hashlib
 import json
 import logging
 import re
-import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -21,7 +20,7 @@ from rxcli import __version__, outputs
 from rxcli.cli.common import claim_outputs, receiver_options, refuse
 from rxcli.cli.printing import JsonLines, PayloadTable, Progress, Table, Writer, print_line, print_text
 from rxcli.errors import ExitCode, InputError, ReceiverError, worst
-from rxcli.ingest import KNOWN_SUFFIXES, open_source
+from rxcli.ingest import KNOWN_SUFFIXES, MAX_BYTES, open_source
 from rxcli.link.collector import PhotoCollector
 from rxcli.link.saving import save_objects
 from rxcli.profiles import dump_profile
@@ -43,6 +42,8 @@ _NO_MATTER = frozenset(
 )
 #: The source that is read from stdin.
 STDIN = "-"
+#: Bytes that are read of it at a time.
+_STDIN_BYTES = 1 << 20
 
 
 def run(paths: tuple[str, ...], given: dict[str, Any]) -> ExitCode:
@@ -130,7 +131,10 @@ def _stdin_as_file(sources: list[batch.Source]) -> Iterator[list[batch.Source]]:
     with ExitStack() as stack:
         try:
             file = stack.enter_context(NamedTemporaryFile(prefix="vlc-rx-"))
-            shutil.copyfileobj(sys.stdin.buffer, file)
+            while part := sys.stdin.buffer.read(_STDIN_BYTES):
+                file.write(part)
+                if file.tell() > MAX_BYTES:
+                    raise InputError(f"stdin: more than {MAX_BYTES / 1e9:g} GB", "name a file instead of -")
             file.flush()
         except OSError as error:
             reason = f"stdin: cannot be kept in a temporary file ({error.strerror or error})"

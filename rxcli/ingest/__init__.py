@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rxcli.errors import InputError, UsageError
-from rxcli.ingest.sniff import HEAD_BYTES, KNOWN_SUFFIXES, Kind, check_file, check_no_list, read_bytes, sniff
+from rxcli.ingest.sniff import HEAD_BYTES, KNOWN_SUFFIXES, MAX_BYTES, Kind, check_file, check_no_list, read_bytes, sniff
 from rxcli.types import Frame
 
-__all__ = ["KNOWN_SUFFIXES", "open_source"]
+__all__ = ["KNOWN_SUFFIXES", "MAX_BYTES", "open_source"]
 
 
 def open_source(path: str | Path) -> Iterator[Frame]:

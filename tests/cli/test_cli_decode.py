@@ -75,6 +75,14 @@ def test_lines_for_programs_and_nothing_else_on_stdout(
     assert name in err  # the summary
 
 
+def test_stdin_without_end_is_bounded(decode: Decode, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(buffer=SimpleNamespace(read=bytes)))
+    monkeypatch.setattr("rxcli.cli.decoding.MAX_BYTES", 3_000_000)
+    code, out, err = decode("-")
+    assert (code, out) == (3, "")
+    assert "stdin: more than 0.003 GB; name a file instead of -" in err
+
+
 def test_a_failed_photo_says_why_once(tmp_path: Path, decode: Decode) -> None:
     (tmp_path / "b.png").write_bytes(b"")
     reason = "the file is empty (0 bytes); copy it from the camera again"
