@@ -267,3 +267,22 @@ def test_python_checks_values_as_files_are_checked(kind: Any, change: dict[str, 
     assert lens == LensModel(**good[LensModel])
     with pytest.raises(ProfileError, match="ScreenProfile: columns"):
         receiver_options(msgspec.structs.replace(screen, columns=0))
+
+
+@pytest.mark.parametrize(
+    ("title", "kind"),
+    [
+        ("Screen profile", ScreenProfile),
+        ("Camera profile", CameraProfile),
+        ("Readout mode", ReadoutMode),
+        ("Lens model", LensModel),
+    ],
+)
+def test_the_page_on_profiles_lists_every_field_with_its_default(title: str, kind: type[msgspec.Struct]) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "profiles.md").read_text(encoding="utf-8")
+    section = page.split(f"\n## {title}\n")[1].split("\n## ")[0]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if line.startswith("| `")]
+    listed = {name.strip("`"): default.strip("`") for name, _, default, _ in rows}
+    fields = msgspec.structs.fields(kind)
+    defaults = {f.name: "needed" if f.required else repr(f.default).replace("'", '"') for f in fields}
+    assert listed == defaults

@@ -56,10 +56,11 @@ def _write_bin(file: IO[bytes], chunks: Iterable[Slots], n_slots: int, screen: S
 def _write_header(file: IO[bytes], chunks: Iterable[Slots], n_slots: int, screen: ScreenProfile) -> None:
     width = bytes_per_row(screen)
     file.write(
-        f"/* {order_of(screen)}; column 0 is the most significant bit of the first byte. */\n"
-        f"#include <stdint.h>\n#define VLC_SLOT_RATE_HZ {screen.slot_rate_hz:g}\n#define VLC_COLUMNS {screen.columns}\n"
+        f"/* {order_of(screen)};\n   column 0 is the most significant bit of the first byte. */\n#include <stdint.h>\n"
+        f"#define VLC_SLOT_RATE_HZ {screen.slot_rate_hz:g}\n#define VLC_COLUMNS {screen.columns}\n"
         f"#define VLC_BYTES {width}\n#define VLC_SLOTS {n_slots}\n"
-        "static const uint8_t vlc_slots[VLC_SLOTS][VLC_BYTES] = {\n".encode()
+        "#ifndef VLC_STORAGE\n#define VLC_STORAGE\n#endif\n"
+        "static const uint8_t vlc_slots[VLC_SLOTS][VLC_BYTES] VLC_STORAGE = {\n".encode()
     )
     for slots in chunks:
         rows = (",".join(f"0x{byte:02x}" for byte in row) for row in np.packbits(slots, axis=1).tolist())

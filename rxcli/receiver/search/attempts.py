@@ -12,7 +12,7 @@ from rxcli.receiver.frame.result import Failure, Received, failed
 from rxcli.receiver.plane import orientation
 from rxcli.receiver.search.cameras import known_camera
 from rxcli.receiver.search.outlines import ON_ITS_SIDE, lean_on_its_side, unreadable_orientation
-from rxcli.receiver.search.refusal import likeliest_reason
+from rxcli.receiver.search.refusal import STEADY_LIGHT, likeliest_reason
 from rxcli.types import Frame, FrameResult
 
 _UPSIDE_DOWN = (
@@ -37,7 +37,7 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
     if received.n_believable:
         remark = _UPSIDE_DOWN if _is_reversed(received.result) else _AS_STORED if asks_for_turn else None
         return received.with_remark(remark)
-    if options.corners is not None:
+    if options.corners is not None or received.result.message == STEADY_LIGHT:
         return received
     lean = lean_on_its_side(upright, options)
     if not lean:
