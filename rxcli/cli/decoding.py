@@ -29,6 +29,7 @@ from rxcli.results.baseline import load_baseline
 from rxcli.results.truth import Scorer, load_truth, truth_for
 from rxcli.runs import batch
 from rxcli.runs.journal import Head, Journal, Lines
+from rxcli.runs.provenance import settings_in_force
 from rxcli.types import BELIEVABLE, FrameResult
 
 log = logging.getLogger(__name__)
@@ -193,11 +194,11 @@ class _Run:
         return worst([*self._conclude(), summary.exit_code(self._summaries, self._limits)])
 
     def _head(self) -> Head:
-        """What the results depend on: the version, the options, what the profiles hold."""
+        """What the results depend on: the version, the options, what the profiles hold, the thresholds in force."""
         given = {name: value for name, value in self._given.items() if name not in _NO_MATTER}
         configured = self._decoder.options
         profiles = msgspec.json.encode((configured.screens, configured.cameras))
-        mark = {"profiles": hashlib.sha256(profiles).hexdigest()[:16]}
+        mark = {"profiles": hashlib.sha256(profiles).hexdigest()[:16], "settings": settings_in_force()}
         return Head(__version__, json.loads(json.dumps(given, default=str)) | mark)
 
     def _recover(self, journal: Journal, lines: Lines) -> set[str]:

@@ -58,7 +58,7 @@ def inspection_page(
         "texts": text_rows(result),
         "facts": _facts(frame, result),
         "picture": picture_of(result, frame, preview(frame, _WIDTH_PX), screen, camera),
-        "maps": [shown for shown in (column_map(frame),) if shown],
+        "maps": [shown for shown in (column_map(frame, result, screen, camera),) if shown],
         "timeline": [
             [entry.frame, entry.time_s, headline(entry), len(entry.packets), entry.status in ("ok", "partial")]
             for entry in timeline

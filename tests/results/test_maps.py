@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.results.maps import column_map
-from rxcli.types import Frame
+from rxcli.types import Frame, FrameResult
 
 HEIGHT, WIDTH = 1200, 1000
 
@@ -21,12 +25,21 @@ def drawn(light: float) -> NDArray[np.uint8]:
     return np.clip(luma, 0, 255).astype(np.uint8)
 
 
-def test_borders_of_the_grid_are_drawn_where_one_stands_out() -> None:
-    shown, nothing = (column_map(Frame(drawn(light), "drawn")) for light in (40.0, 0.0))
+def test_borders_of_the_columns_are_drawn_where_a_screen_was_found() -> None:
+    screen, corners = (
+        load_profile("paper-17k3", ScreenProfile),
+        np.array([[50, 0], [950, 0], [950, 1199], [50, 1199.0]]),
+    )
+    frame, nothing = Frame(drawn(40.0), "drawn"), FrameResult("drawn", 0, 0.0, "no_screen")
+    shown = column_map(frame, replace(nothing, status="ok", corners=corners), screen, None)
+    missing = column_map(frame, nothing, None, None)
     assert shown is not None
-    assert nothing is not None
-    assert len(shown["grids"][0]["lines"]) >= 15
-    assert round(shown["grids"][0]["pitch_px"]) == 45
-    assert nothing["grids"] == []
-    assert "No grid of columns stands out" in nothing["text"]
-    assert column_map(Frame(np.zeros((64, 400), np.uint8), "tiny")) is None
+    assert missing is not None
+    [grid] = shown["grids"]
+    assert len(grid["lines"]) == 21
+    assert grid["pitch_px"] == pytest.approx(45)
+    np.testing.assert_allclose([line[0, 0] for line in grid["lines"]], 0.64 * (50 + 45 * np.arange(21)), atol=0.1)
+    assert missing["grids"] == []
+    assert "No grid of columns stands out" in missing["text"]
+    assert shown["jpeg"] == missing["jpeg"]
+    assert column_map(Frame(np.zeros((64, 400), np.uint8), "tiny"), nothing, None, None) is None

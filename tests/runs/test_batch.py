@@ -12,9 +12,11 @@ import pytest
 from fake_receiver import fake_decoder
 
 from rxcli.errors import InputError, UsageError
+from rxcli.receiver.search.settings import SETTINGS
 from rxcli.results.record import to_json_line
 from rxcli.runs.batch import Source, collect_sources, decode_here, decode_in_processes, unreadable
 from rxcli.runs.journal import Head, Journal, Lines
+from rxcli.runs.provenance import settings_in_force
 
 SUFFIXES = frozenset({".jpg", ".mp4"})
 
@@ -115,6 +117,17 @@ def test_wrong_options_end_a_run(tmp_path: Path) -> None:
     ):
         with pytest.raises(UsageError, match="make no sense"):
             lines(decoded)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("screen.find._PARTS", 6), ("search.settings.SETTINGS", replace(SETTINGS, plain=399.0)), ("light._MAX_MEMORY", 4)],
+)
+def test_a_changed_threshold_shows_in_the_provenance(name: str, value: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = settings_in_force()
+    assert before == settings_in_force()
+    monkeypatch.setattr(f"rxcli.receiver.{name}", value)
+    assert settings_in_force() != before
 
 
 def write_journal(path: Path, names: str) -> bytes:

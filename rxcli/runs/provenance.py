@@ -1,0 +1,30 @@
+"""Which numbers a result depends on, beside version, options and profiles."""
+
+from __future__ import annotations
+
+from dataclasses import is_dataclass
+from hashlib import sha256
+from importlib import import_module
+from pkgutil import walk_packages
+from typing import Any
+
+from rxcli import receiver
+from rxcli.resources import data_dir
+
+
+def settings_in_force() -> str:
+    """Hash of the receiver's thresholds (settings objects and named numbers) and of its fitted models."""
+    names = sorted(found.name for found in walk_packages(receiver.__path__, f"{receiver.__name__}."))
+    numbers = {
+        f"{name}.{constant}": value
+        for name in names
+        for constant, value in sorted(vars(import_module(name)).items())
+        if constant.isupper() and _is_fixed(value)
+    }
+    models = [path.read_bytes() for path in sorted(data_dir("models").glob("*/model.toml"))]
+    return sha256(repr(numbers).encode() + b"".join(models)).hexdigest()[:16]
+
+
+def _is_fixed(value: Any) -> bool:
+    """Whether a constant is a number, numbers, or a settings object."""
+    return isinstance(value, (int, float, tuple)) or (is_dataclass(value) and not isinstance(value, type))
