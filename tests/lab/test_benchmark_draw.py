@@ -12,7 +12,7 @@ import pytest
 
 from rxcli.lab.benchmark import draw
 from rxcli.lab.benchmark.cases import WAYS
-from rxcli.lab.benchmark.draw import DRAWERS, Place, phone_of, screen_of
+from rxcli.lab.benchmark.draw import DRAWERS, Place
 from rxcli.lab.benchmark.measures import MEASURES
 from rxcli.lab.benchmark.media import Medium
 from rxcli.lab.benchmark.runner import scenarios
@@ -21,7 +21,6 @@ from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.pictures import DARK_KINDS, draw_dark_picture
 from rxcli.lab.simulate.population import Population
 from rxcli.lab.simulate.scenes import preset
-from rxcli.types import Frame
 
 
 def test_every_row_of_the_table_names_what_there_is() -> None:
@@ -30,22 +29,6 @@ def test_every_row_of_the_table_names_what_there_is() -> None:
         assert set(scenario.ways) <= {*WAYS, "another kernel"}, name
         assert set(scenario.all_columns) <= MEASURES.keys(), name
         assert scenario.beside is None or scenario.beside in scenario.ways, name
-
-
-def test_phones_are_as_asked_for() -> None:
-    drawn = [phone_of(3, number) for number in range(60)]
-    assert len({turned for _, turned in drawn}) == 2
-    assert {scene.isp.correct_distortion for scene, _ in drawn} == {False, True}
-    for scene, _ in drawn:
-        sensor, screen = scene.sensor, scene.screen
-        assert 1.5 <= scene.rows_per_slot <= 20
-        assert 5e-3 <= sensor.line_delay_s * sensor.height <= 45e-3
-        assert 0.65 <= scene.lens.focal_widths <= 1.2
-        assert abs(scene.lens.distortion[0]) <= 0.15
-        rows = scene.pose.fill * sensor.width / screen.aspect
-        assert rows / scene.rows_per_slot / screen.packet_slots >= 1.3
-    assert phone_of(3, 7) == drawn[7]
-    assert drawn[7] != drawn[8]
 
 
 def test_people_take_what_the_population_says() -> None:
@@ -65,23 +48,19 @@ def test_people_take_what_the_population_says() -> None:
     assert replace(again, picture="") == replace(drawn[5][0], picture="")
 
 
-def test_seeds_of_published_figures_draw_the_scenes_of_old() -> None:
-    scene, turned = phone_of(501, 0)
-    assert (scene.picture, turned) == ("hubble", False)
-    assert (scene.rows_per_slot, scene.blur_px) == pytest.approx((4.934242608710645, 0.5571024930222309))
-    screen, kind = screen_of(60613, 1)
-    assert (kind, screen.screen.name) == ("night", "paper-34k6")
-    assert (screen.pose.shift_x, screen.blur_px) == pytest.approx((0.009276227773983495, 1.4390870244467169))
-
-
-def test_screens_lie_in_the_picture_and_are_dark_half_of_the_time() -> None:
-    drawn = [screen_of(5, number) for number in range(30)]
-    assert 6 < sum(kind != "photo" for _, kind in drawn) < 24
-    for scene, _ in drawn:
+@pytest.mark.parametrize("name", [name for name, row in scenarios().items() if row.draw == "people"])
+def test_points_of_populations_can_be_drawn(name: str) -> None:
+    for point in scenarios()[name].points.values():
+        people = msgspec.convert(scenarios()[name].base | point, draw.People)
+        scene, _ = people.draw(np.random.default_rng(3))
+        assert scene.screen.name in people.screens
+        assert scene.n_frames == people.n_frames
         sensor = scene.sensor
+        if people.width_px is not None:
+            assert people.width_px[0] <= sensor.width + 0.5 <= people.width_px[1] + 1
         corners = View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect).corners
-        assert (corners > 0).all()
-        assert (corners < np.array([sensor.width, sensor.height])).all()
+        assert (corners > -0.1 * sensor.width).all()
+        assert people.encoding(scene, np.random.default_rng(1))[0] in people.codecs
 
 
 @pytest.mark.parametrize("kind", DARK_KINDS)
@@ -125,31 +104,31 @@ def test_every_other_picture_without_data_is_striped(tmp_path: Path) -> None:
     assert all(case.options.force_camera and not case.has_data for case in cases)
 
 
-def test_the_files_of_clips_go_away() -> None:
+def test_files_of_captures_go_away(tmp_path: Path) -> None:
     small = preset("video-1080p", "paper-8k65").scaled(0.2, 0.2, keep_readout=True)
-    take = draw.prepare(replace(small, picture="coffee", n_frames=2), 44)
-    with draw.filmed(take, [("h264", "veryfast", 2_000_000), ("hevc", "veryfast", 2_000_000)]) as paths:
-        assert all(path.stat().st_size > 1000 for path in paths)
-    assert not paths[0].parent.exists()
+    with draw.recorded(
+        replace(small, n_frames=2), Place(0, 44, {}, tmp_path), encoding=("hevc", "veryfast", 10**6)
+    ) as case:
+        (path,) = case.source
+        assert isinstance(path, Path)
+        assert path.stat().st_size > 1000
+    assert not path.parent.exists()
 
 
 def test_points_of_sweeps_have_scenes() -> None:
     for scenario in (scenario for scenario in scenarios().values() if scenario.draw == "point"):
         for point in ({**scenario.base, **values} for values in scenario.points.values()):
             scene = draw.scene_at(**point)
-            narrow = point.get("is_binned", True) and "megapixels" not in point
+            narrow = point.get("is_binned", True)
             assert scene.screen.columns == point.get("columns", 20)
             assert not narrow or scene.sensor.width <= scene.screen.columns * 46
-            if megapixels := point.get("megapixels"):  # the same time at any size
-                assert scene.sensor.width * scene.sensor.height == pytest.approx(megapixels * 1e6, rel=0.01)
-                assert scene.sensor.height * scene.sensor.line_delay_s == pytest.approx(24.098e-3, rel=1e-3)
 
 
 def test_rows_are_moved_smoothly_and_no_further_than_said() -> None:
     ramp = np.add.outer(np.arange(200), np.arange(300)).astype(np.uint16) * 10  # a pixel either way is ten levels
     moves = []
     for seed in range(20):
-        pixels = draw.warped(Frame(ramp, "ramp"), np.random.default_rng(seed), 6.0).pixels.astype(np.float64)
+        pixels = draw.warped(ramp, np.random.default_rng(seed), 6.0).astype(np.float64)
         moved = (pixels - ramp)[10:-10, 10:-10] / 10
         assert np.ptp(moved, axis=1).max() <= 0.2  # rows keep their shape
         assert np.abs(np.diff(moved[:, 0])).max() < 0.6

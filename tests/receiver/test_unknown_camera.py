@@ -12,7 +12,6 @@ from small_frames import BOTTOM, LEFT, RIGHT, ROWS_PER_SLOT, SCREEN, TOP, write_
 from small_scene import scored
 
 from rxcli.ingest import open_source
-from rxcli.lab.benchmark.draw import FIRST_SEED, as_stored, phone_of
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.isp import Isp, Tone
 from rxcli.lab.simulate.optics import Lens, Pose
@@ -25,7 +24,7 @@ from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.receive import receive
 from rxcli.receiver.search import Found, cameras, search
-from rxcli.types import Frame
+from rxcli.types import Frame, Metadata
 
 CORNERS = np.array([[LEFT, TOP], [RIGHT, TOP], [RIGHT, BOTTOM], [LEFT, BOTTOM]], float)
 OPTIONS = ReceiverOptions(
@@ -40,10 +39,22 @@ def _frame(folder: Path) -> tuple[Frame, list[str]]:
 
 def test_packets_of_a_long_exposure_are_received() -> None:
     """It shows less than two packets, so that longer ones fit its light as well, without a second header."""
-    scene, turned = phone_of(777, 71)
-    trial = simulate_trial(scene, FIRST_SEED + 71)
-    frame, corners = as_stored(trial, turned)
-    options = ReceiverOptions(cameras=(), corners=corners, cae="never")
+    base = preset("phone-plain", "paper-8k65")
+    scene = replace(
+        base,
+        sensor=replace(base.sensor, width=960, height=720, line_delay_s=3.118e-5, full_scale_e=260.0, read_noise_e=2.0),
+        lens=Lens(0.7678, (0.13124, -0.06682, -3.08e-4, 4.71e-4, 0.0)),
+        pose=Pose(0.82687, 0.567, -9.959, 1.465, -0.00605, 0.00226),
+        isp=Isp("srgb", 2.0, 0.3195, denoise_px=0.294, correct_distortion=True, quality=90),
+        picture="rocket",
+        w=4,
+        exposure_s=2.505e-4,
+        light_e_per_s=2.807e5,
+        blur_px=0.87,
+    )
+    trial = simulate_trial(scene, 1071)
+    frame = replace(trial.frame, metadata=Metadata())
+    options = ReceiverOptions(cameras=(), corners=trial.corners, cae="never")
     result, _ = scored(next(iter(receive([frame], options))), trial.truth)
     assert sum(packet.bit_errors == 0 for packet in result.packets) >= 10
 

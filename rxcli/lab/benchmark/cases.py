@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass, replace
 from functools import lru_cache
-from itertools import chain
 from multiprocessing.connection import Connection
 from pathlib import Path
 from time import perf_counter, process_time
@@ -22,9 +21,8 @@ import numpy as np
 
 from rxcli.ingest import open_source
 from rxcli.lab.benchmark.media import bare_decode
-from rxcli.lab.benchmark.trial import SOURCE, Trial, write_still
+from rxcli.lab.benchmark.trial import SOURCE, Trial
 from rxcli.lab.benchmark.yardsticks import bound_result, paper_result
-from rxcli.lab.simulate.files import write_video
 from rxcli.link.collector import Collector, PhotoCollector
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.outputs import write_whole
@@ -50,8 +48,8 @@ _MIN_SHIFTED = 2
 class Case:
     """One scene or clip as a receiver gets it, with what is known of it."""
 
-    #: Frames in memory, a file, or files of photographs that are taken of one transmission.
-    source: tuple[Frame, ...] | Path | tuple[Path, ...]
+    #: A file, files of photographs that are taken of one transmission, or frames in memory.
+    source: tuple[Path, ...] | tuple[Frame, ...]
     options: ReceiverOptions
     #: Rows of the table that count this case, beside the row of all cases.
     groups: tuple[str, ...] = ()
@@ -72,10 +70,6 @@ class Case:
     #: The simulated photographs, for the bound and the paper's pipeline.
     trials: tuple[Trial, ...] = ()
 
-    def frames(self) -> Iterable[Frame]:
-        """The frames in order of time."""
-        return chain.from_iterable(self._sources())
-
     def receive(
         self, options: ReceiverOptions, changed: Callable[[Frame], Frame] | None = None
     ) -> Iterator[FrameResult]:
@@ -86,15 +80,17 @@ class Case:
                 yield result if len(sources) == 1 else replace(result, frame=number)
 
     def _sources(self) -> list[Iterable[Frame]]:
-        sources = (self.source,) if isinstance(self.source, Path) else self.source
-        files = [open_source(source) for source in sources if isinstance(source, Path)]
-        return list(files) or [sources]  # type: ignore[list-item]
+        files = [open_source(source) for source in self.source if isinstance(source, Path)]
+        return list(files) or [[source for source in self.source if isinstance(source, Frame)]]
 
 
 def write_case(case: Case, stem: Path) -> list[Path]:
     """Write a case as files of this stem, their truth beside them; returns where."""
     stem.parent.mkdir(parents=True, exist_ok=True)
-    paths = list(_written(case, stem))
+    paths = []
+    for number, file in enumerate(path for path in case.source if isinstance(path, Path)):
+        turn = f"-{number}" if len(case.source) > 1 else ""
+        paths.append(shutil.copyfile(file, stem.with_name(stem.name + turn + file.suffix)))
     known: Sequence[Any] = [trial.capture.truth for trial in case.trials]
     truths = known or [case.whole_truth or case.truth] * len(paths)
     for path, truth in zip(paths, truths, strict=True):
@@ -115,27 +111,6 @@ def arguments_of(paths: Sequence[Path], options: ReceiverOptions) -> list[str]:
     if options.corners is not None:
         arguments += ["--corners", *(f"{x:.3f},{y:.3f}" for x, y in options.corners)]
     return arguments + [part for name in SKIPS if name not in options.skip for part in ("--no-skip", name)]
-
-
-def _written(case: Case, stem: Path) -> Iterator[Path]:
-    """The case's files: copies, a clip of several frames, a DNG where a mosaic was simulated, or else a PNG."""
-    sources = (case.source,) if isinstance(case.source, Path) else case.source
-    frames = [source for source in sources if not isinstance(source, Path)]
-    scene = case.trials[0].capture.scene if case.trials else None
-    for number, source in enumerate(sources):
-        if isinstance(source, Path):
-            turn = f"-{number}" if len(sources) > 1 else ""
-            yield Path(shutil.copyfile(source, stem.with_name(f"{stem.name}{turn}{source.suffix}")))
-    if len(frames) > 1:
-        pictures = (cv2.cvtColor(np.asarray(each.pixels), cv2.COLOR_GRAY2RGB) for each in frames)
-        write_video(pictures, stem.with_suffix(".mp4"), "h264", 1 / (frames[1].time_s - frames[0].time_s))
-        yield stem.with_suffix(".mp4")
-    elif frames and (scene is None or frames[0] is not case.trials[0].frame):
-        # A picture that was changed after its simulation is stored anew, without metadata.
-        write_whole(stem.with_suffix(".png"), cv2.imencode(".png", np.asarray(frames[0].pixels))[1].tobytes())
-        yield stem.with_suffix(".png")
-    elif frames and scene is not None:
-        yield write_still(case.trials[0].capture, stem)
 
 
 def _with_options(**changes: Any) -> Way:
@@ -201,7 +176,6 @@ def received(case: Case, way: str) -> Record:
         except Exception as error:
             problems.append(f"{type(error).__name__}: {error}")
     cpu_s, wall_s = process_time() - start, perf_counter() - wall
-    texts = list(_texts(results, case)) if case.text is not None else []
     problems += [f"{w.category.__name__}: {w.message} ({Path(w.filename).name}:{w.lineno})" for w in caught]
     problems += [problem for result in results for problem in nonsense(result)]
     stages_ms = sum((Counter(result.timing_ms) for result in results), Counter[str]())
@@ -214,7 +188,7 @@ def received(case: Case, way: str) -> Record:
         "problems": list(dict.fromkeys(problems)),
         "score": None if scorer is None else asdict(scorer.score()),
         "packets": [packet for result in results for packet in _packets(result, case)],
-        "texts": [text == case.text for text in texts],
+        "texts": [text == case.text for text in _texts(results, case)],
         **(_found(results[0], case) if results else {"status": "exception"}),
     }
 
@@ -234,7 +208,7 @@ def _serve(connection: Connection) -> None:
 
 def bare(case: Case) -> Record:
     """Frames of a case's file, and seconds that its bare decode takes; nothing where there is none."""
-    decode = bare_decode(case.source) if isinstance(case.source, Path) else None
+    decode = bare_decode(case.source[0]) if isinstance(case.source[0], Path) and len(case.source) == 1 else None
     if decode is None:
         return {}
     with threads(1):
@@ -256,14 +230,12 @@ def _packets(result: FrameResult, case: Case) -> Iterator[Record]:
 
 def _texts(results: Sequence[FrameResult], case: Case) -> Iterator[str | None]:
     """The messages that the link layer makes of the results, photographs together."""
-    several = isinstance(case.source, tuple)
-    collector = (PhotoCollector if several else Collector)(case.options.screens)
-    for number, result in enumerate(results):
-        # Clips are collected with the source's end, as their last frames bring what was left.
+    collector = (PhotoCollector if case.trials else Collector)(case.options.screens)
+    for result in results if case.text is not None else ():
         added = collector.add(replace(result, source=SOURCE))
-        last = number == len(results) - 1 and not several
-        for message in (collector.finish(added) if last else added).messages:
-            yield message.text
+        # A clip's end brings what was left.
+        ended = result is results[-1] and not case.trials
+        yield from (message.text for message in (collector.finish(added) if ended else added).messages)
 
 
 def _found(result: FrameResult, case: Case) -> Record:

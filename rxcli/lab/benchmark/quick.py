@@ -20,7 +20,6 @@ _MEDIA = ("jpeg-26mp", "raw-26mp", "jpeg-26mp-hard", "jpeg-12mp-unknown")
 _REPEATS, _SCENES = 3, 20
 #: Column of a table -> way and measure.
 _ERRORS = {
-    "kb/s": ("receiver", "rate_kbps"),
     "packets": ("receiver", "expected"),
     "receiver": ("receiver", "ber"),
     "receiver95": ("receiver", "ber95"),

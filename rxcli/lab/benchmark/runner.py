@@ -98,10 +98,8 @@ def do(task: Task) -> list[Record]:
         groups = [*filter(None, [task["label"]]), *case.groups]
         about = {"number": task["number"], **case.about}
         if task.get("save"):
-            stem = Path(task["save"]) / "-".join(
-                [*task["label"].split(), str(task["seed"]), str(task["number"]), str(turn)]
-            )
-            save(case, stem, {"about": about, "groups": groups, "ways": ways})
+            name = f"{task['label']} {task['seed']} {task['number']} {turn}".strip().replace(" ", "-")
+            save(case, Path(task["save"]) / name, {"about": about, "groups": groups, "ways": ways, "text": case.text})
         records.append({"about": about, "has_data": case.has_data, "groups": groups, **bare(case), "ways": ways})
     return records
 
@@ -112,12 +110,9 @@ def save(case: Case, stem: Path, known: Record) -> None:
     The arguments under "named" name screen, camera and corners.
     """
     paths = write_case(case, stem)
-    known |= {
-        "files": [path.name for path in paths],
-        "corners": None if case.corners is None else case.corners.tolist(),
-    }
-    known["arguments"] = arguments_of(paths, case.options)
+    known |= {"files": [path.name for path in paths], "arguments": arguments_of(paths, case.options)}
     known["named"] = None if case.named is None else arguments_of(paths, case.named)
+    known["corners"] = None if case.corners is None else case.corners.tolist()
     write_whole(stem.with_name(stem.name + ".case.json"), json.dumps(known) + "\n")
 
 

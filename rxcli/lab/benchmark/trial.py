@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from rxcli.lab.simulate.camera import Exposure
 from rxcli.lab.simulate.capture import Capture, simulate_frame
 from rxcli.lab.simulate.files import write_dng
 from rxcli.lab.simulate.optics import View
@@ -40,16 +41,12 @@ class Trial:
     @cached_property
     def camera(self) -> CameraProfile:
         """The camera as a perfect calibration would know it."""
-        scene = self.capture.scene
-        tone = scene.isp.tone if scene.isp.tone in ("linear", "srgb", "bt709") else "auto"
-        return msgspec.structs.replace(build_camera_profile(scene, self.capture.exposure), tone=tone)
+        return known_camera(self.capture.exposure)
 
     @cached_property
     def corners(self) -> FloatArray:
         """(4, 2) the screen's corners on the stored picture, top-left first, clockwise for a viewer."""
-        scene = self.capture.scene
-        corrected = scene.isp.correct_distortion and scene.output == "developed"
-        return corners_on_picture(self.capture.exposure.view, corrected)
+        return known_corners(self.capture.exposure)
 
     @cached_property
     def truth(self) -> Truth:
@@ -75,12 +72,23 @@ def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False, threads: in
 
 def write_still(capture: Capture, stem: Path) -> Path:
     """Write a photograph as a JPEG or DNG of this stem; returns where."""
-    path = stem.with_name(stem.name + (".dng" if capture.scene.is_mosaic else ".jpg"))
     if capture.scene.is_mosaic:
-        write_dng(capture.raw, capture.scene, path)
+        write_dng(capture.raw, capture.scene, path := stem.with_name(stem.name + ".dng"))
     else:
-        write_whole(path, capture.jpeg)
+        write_whole(path := stem.with_name(stem.name + ".jpg"), capture.jpeg)
     return path
+
+
+def known_camera(exposure: Exposure) -> CameraProfile:
+    """The camera as a perfect calibration would know it."""
+    tone = exposure.scene.isp.tone if exposure.scene.isp.tone in ("linear", "srgb", "bt709") else "auto"
+    return msgspec.structs.replace(build_camera_profile(exposure.scene, exposure), tone=tone)
+
+
+def known_corners(exposure: Exposure) -> FloatArray:
+    """(4, 2) the screen's corners on the stored picture, top-left first, clockwise for a viewer."""
+    corrected = exposure.scene.isp.correct_distortion and not exposure.scene.is_mosaic
+    return corners_on_picture(exposure.view, True) if corrected else exposure.corners
 
 
 def corners_on_picture(view: View, corrected: bool) -> FloatArray:

@@ -12,7 +12,7 @@ import numpy as np
 from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.optics import FloatArray, Lens, Pose, View
 from rxcli.lab.simulate.pictures import DARK_KINDS, PHOTOS, draw_dark_picture, draw_part
-from rxcli.lab.simulate.scenes import Scene, draw_weight, preset, with_fields
+from rxcli.lab.simulate.scenes import Scene, preset, with_fields
 
 Generator = np.random.Generator
 Range = tuple[float, float]
@@ -24,8 +24,10 @@ _LIGHT, _HEADROOM = (0.9e6, 2.2e6), (1.6, 2.4)
 _DARK_ROOM, _LIGHTED_ROOM = (-4.0, -2.5), (-2.0, -0.8)
 #: Standard deviations of roll, yaw and pitch, degrees, and of the place (1: at the picture's edge) with an aim of 1.
 _ANGLES_DEG, _PLACE = (1.2, 4.0, 3.0), 0.35
-#: Share of pictures that a camera held upside down takes.
-_UPSIDE_DOWN = 0.15
+#: Narrower sensors see a panel of fewer pixels: drawing the picture would take longer than its reception.
+_NARROW_PX, _SMALL_PANEL_PX = 700, (342, 192)
+#: Share of pictures that a camera held upside down takes, and of screens whose columns light by the picture.
+_UPSIDE_DOWN, _DIMMED = 0.15, 0.3
 
 
 class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -47,11 +49,19 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     #: Share of dark pictures, and of lighted rooms.
     dark: float = 0.0
     lighted: float = 0.5
-    #: Width of the sensor in pixels, all rows kept; None for the camera's own.
-    width_px: int | None = None
+    #: Width of the sensor in pixels, and share of its rows, in the same time; None for the camera's own width.
+    width_px: Range | None = None
+    rows: Range = (1.0, 1.0)
+    #: Electrons against what the exposure should give, and how far columns may be late, slots.
+    light: Range = (1.0, 1.0)
+    column_delay_slots: Range = (0.0, 0.0)
+    #: Share of mosaics among photographs.
+    raw: float = 0.0
     #: Of clips; a photograph has one.
     n_frames: int = 1
     frame_rate_hz: float = 29.97
+    #: Pixels by which a hand moves the picture from frame to frame.
+    hand_px: Range = (0.0, 0.0)
     #: Fields of the scene that are set at last, as in `vlc-rx simulate --set`.
     scene: dict[str, Any] = {}
 
@@ -70,12 +80,16 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         scene, readout_s = preset(name, screen), log_uniform(rng, self.readout_s)
         if name.startswith("phone"):
             scene = _as_phone(scene, readout_s, rng)
-        if self.width_px is not None:
-            scene = scene.scaled(self.width_px / scene.sensor.width, 1.0)
+        width_px = scene.sensor.width if self.width_px is None else round(_within(rng, self.width_px))
+        scene = scene.scaled(width_px / scene.sensor.width, _within(rng, self.rows), keep_readout=True)
+        if width_px < _NARROW_PX:
+            panel = dict(zip(("width_px", "height_px"), _SMALL_PANEL_PX, strict=True))
+            scene = replace(scene, screen=msgspec.structs.replace(scene.screen, **panel))
         exposure_s = log_uniform(rng, self.exposure_slots) / scene.screen.slot_rate_hz
         light_e_per_s = log_uniform(rng, _LIGHT)
         full_scale_e = light_e_per_s * scene.exposure_s * scene.isp.gain * rng.uniform(*_HEADROOM)
-        scene = replace(scene, light_e_per_s=light_e_per_s, sensor=replace(scene.sensor, full_scale_e=full_scale_e))
+        sensor = replace(scene.sensor, full_scale_e=full_scale_e)
+        scene = replace(scene, light_e_per_s=light_e_per_s * _within(rng, self.light), sensor=sensor)
         roll, yaw, pitch = self.aim * rng.normal(0, _ANGLES_DEG)
         turned = rng.random() < _UPSIDE_DOWN
         scene = replace(scene.metered(exposure_s), orientation=3 if turned else 1)
@@ -90,16 +104,25 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         picture = draw_dark_picture(kind, rng, *size) if dark else draw_part(kind, rng, *size)
         room_light = 10 ** rng.uniform(*(_LIGHTED_ROOM if rng.random() < self.lighted else _DARK_ROOM))
         room = replace(scene.room, light_e_per_s=scene.light_e_per_s * room_light)
-        clip: dict[str, Any] = {"n_frames": self.n_frames, "frame_rate_hz": self.frame_rate_hz}
-        blur_px, slot_rate_error_ppm = rng.uniform(0.5, 1.3), rng.uniform(-50, 50)
-        scene = replace(scene, picture=picture, w=draw_weight(rng, 0.3, 3), room=room, **clip)
-        scene = replace(scene, blur_px=blur_px, slot_rate_error_ppm=slot_rate_error_ppm)
+        drawn: dict[str, Any] = {"n_frames": self.n_frames, "frame_rate_hz": self.frame_rate_hz}
+        drawn |= {"blur_px": rng.uniform(0.5, 1.3), "slot_rate_error_ppm": rng.uniform(-50, 50)}
+        drawn |= {name: _within(rng, getattr(self, name)) for name in ("hand_px", "column_delay_slots")}
+        drawn["w"] = "dimming" if rng.random() < _DIMMED else int(rng.integers(3, 9))
+        scene = replace(scene, picture=picture, room=room, **drawn)
+        if self.raw and rng.random() < self.raw and scene.sensor.pattern is not None:
+            # LibRaw crops the models that it knows.
+            scene = replace(scene, output="raw", make="Synthetic", model=scene.camera_name)
         return with_fields(scene, self.scene), kind
 
 
 def log_uniform(rng: Generator, limits: Range) -> float:
     """A number between two, even on a logarithmic scale."""
     return float(np.exp(rng.uniform(*np.log(limits))))
+
+
+def _within(rng: Generator, limits: Range) -> float:
+    """The same, without a draw where there is nothing to draw."""
+    return limits[0] if limits[0] == limits[1] else log_uniform(rng, limits)
 
 
 def _as_phone(scene: Scene, readout_s: float, rng: Generator) -> Scene:

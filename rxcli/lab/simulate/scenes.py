@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from rxcli.errors import UsageError
 from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.optics import Lens, Pose
-from rxcli.lab.simulate.pictures import draw_name
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.lab.simulate.transmitter import Dimming, LabelSource, Waveform, Weights
 from rxcli.profiles import ScreenProfile, load_profile
@@ -232,27 +231,3 @@ def with_fields(part: Part, table: Mapping[str, Any], place: str = "") -> Part:
             raise UsageError(f"{place}{name} = {value!r}: {error}", "see docs/simulator.md") from None
     changed: Part = replace(part, **values)  # type: ignore[type-var]
     return changed
-
-
-def random_scene(rng: np.random.Generator) -> Scene:
-    """A scene that a person might meet: any preset, screen, picture, pose, light and exposure."""
-    base = preset(str(rng.choice(PRESETS[:5])), str(rng.choice(["paper-8k65", "paper-17k3", "paper-34k6"])))
-    exposure_slots = float(rng.choice([0.25, 0.5, 1.0, 1.5, 2.0])) * rng.uniform(0.8, 1.2)
-    exposure_s = max(exposure_slots / base.screen.slot_rate_hz, 1 / 32000)
-    upside_down = rng.random() < 0.15
-    fill, roll, yaw, pitch = rng.uniform(0.6, 0.97), rng.normal(0, 1.5), rng.normal(0, 6), rng.normal(0, 5)
-    pose = Pose(fill, roll + 180 * upside_down, yaw, pitch, rng.normal(0, 0.02), rng.normal(0, 0.02))
-    picture, w = draw_name(rng), draw_weight(rng, 0.3)
-    light_e_per_s, flicker_hz = base.light_e_per_s * 10 ** rng.uniform(-3, -0.5), float(rng.choice([100, 120]))
-    lamp = float(rng.choice([0.0, rng.uniform(0, 0.05)]))
-    room = replace(base.room, light_e_per_s=light_e_per_s, flicker_hz=flicker_hz, lamp=lamp)
-    scene = replace(base.exposed(exposure_s, 10 ** rng.uniform(-0.7, 0.3)), picture=picture, w=w, pose=pose, room=room)
-    blur_px, slot_rate_error_ppm = rng.uniform(0.4, 3.0), rng.uniform(-100, 100)
-    delay, raw = float(rng.choice([0.0, rng.uniform(0, 2)])), rng.random() < 0.3
-    scene = replace(scene, blur_px=blur_px, slot_rate_error_ppm=slot_rate_error_ppm, column_delay_slots=delay)
-    return replace(scene, n_frames=1, orientation=3 if upside_down else 1, output="raw" if raw else "developed")
-
-
-def draw_weight(rng: np.random.Generator, dimming: float, low: int = 2) -> Weights:
-    """Lit slots of a symbol: by the picture's light with a probability of `dimming`, or the same in all columns."""
-    return "dimming" if rng.random() < dimming else int(rng.integers(low, 9))

@@ -35,7 +35,7 @@ def visible_bursts(exposure: Exposure) -> list[dict[str, Any]]:
     for burst in range(max(int(begin // length), 0), int(end // length) + 1):
         visible = min(end, (burst + 1) * length) - max(begin, burst * length)
         if visible > 0:
-            bursts.append({"burst": burst, "visible_slots": round(visible, 1)})
+            bursts.append({"burst": burst, "visible_slots": round(float(visible), 1)})
     return bursts
 
 

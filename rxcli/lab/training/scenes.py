@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.benchmark.draw import phone_of, screen_of
 from rxcli.lab.simulate.pictures import draw_dark_picture, draw_part
-from rxcli.lab.simulate.scenes import Scene, preset, random_scene
+from rxcli.lab.simulate.population import Population
+from rxcli.lab.simulate.scenes import Scene, preset
 
 #: scikit-image's pictures that training may use; the others are for validation.
 TRAINING_PHOTOS = ("camera", "coins", "hubble", "moon", "page", "retina")
@@ -20,8 +20,12 @@ _DRAWN_DARK = ("terminal", "night", "stars")
 _PHOTOS, _SHAPES = 0.5, 0.35
 #: Width of simulated sensors: narrow ones are quick, and lateral pixels are averaged in strips anyway.
 _WIDTHS = (800, 2000)
-#: Shares of random phones and of screens anywhere in a picture among the scenes; the others are random scenes.
-_PHONES, _SCREENS = 0.4, 0.25
+_POPULATION = Population(
+    cameras=("xs10-still", "video-4k", "video-1080p", "phone-plain", "phone-video"),
+    exposure_slots=(0.25, 2.5),
+    readout_s=(8e-3, 40e-3),
+    column_delay_slots=(0.01, 2.0),
+)
 
 Picture = NDArray[np.uint8]
 
@@ -75,7 +79,7 @@ def training_scene(rng: np.random.Generator) -> Scene:
 
     Pictures and noise are drawn anew, so that no picture and no camera of the benchmark is learned.
     """
-    base = _base_scene(rng)
+    base, _ = _POPULATION.draw(rng)
     white_e = 10 ** rng.uniform(0.5, 2.0)
     sensor = replace(
         base.sensor,
@@ -95,15 +99,6 @@ def training_scene(rng: np.random.Generator) -> Scene:
         camera_name="training",
     )
     return scene.scaled(min(rng.uniform(*_WIDTHS) / sensor.width, 1.0), 1.0)
-
-
-def _base_scene(rng: np.random.Generator) -> Scene:
-    kind, seed = rng.random(), int(rng.integers(2**31))
-    if kind < _PHONES:
-        return phone_of(seed, 0)[0]
-    if kind < _PHONES + _SCREENS:
-        return screen_of(seed, 0)[0]
-    return replace(random_scene(rng), orientation=1)
 
 
 @dataclass(frozen=True)
