@@ -24,7 +24,7 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 _OUT = ("--out", click.Path(file_okay=False, path_type=Path), Path("benchmark-results"), "Folder of results.")
 _SEED = ("--seed", click.IntRange(0, 10**6), 0, "Of all random scenes.")
 _COUNTED = ("--count", _COUNT, None, "Numbers to draw at each point.  [default: the scenario's]")
-_CAPTURES = ("--folder captures", _FOLDER, None, "Of `captures`: where they lie.  [default: the samples]")
+_CAPTURES = ("--folder captures", _FOLDER, None, "Of `captures` and `files`: where they lie.  [default: the samples]")
 _ONLY = ("--only", [str], None, "A point of the scenario; may be given several times.")
 _QUIET = ("--quiet", None, False, "No progress bar.")
 _RUN = (
@@ -107,7 +107,11 @@ def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given
     for measure in ("ber", "share"):
         if points and f"{measure}95" in points[0]:
             tables.plot(points, out / f"{name}.png", measure, f"{measure}95")
-    _say_written(tables.write_outputs(out, name, rows, details))
+    written = tables.write_outputs(out, name, rows, details)
+    plotted = measures.error_over_time(records, scenario.ways) if scenario.draw == "capture" else {}
+    if plotted and all(plotted.values()):
+        written += tables.plot_error_over_time(plotted, out / f"{name}-error-over-time")
+    _say_written(written)
     return ExitCode.OK if measures.passes(records, scenario.ways) else ExitCode.NOT_RECEIVED
 
 

@@ -292,6 +292,19 @@ def test_tables_align_survive_csv_and_are_plotted(tmp_path: Path) -> None:
     assert (tmp_path / "ber.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_error_against_run_time_of_files_is_drawn(tmp_path: Path) -> None:
+    cases = [_record("sky"), _record("sea")]
+    for case, seconds in zip(cases, (0.5, 2.0), strict=True):
+        case["ways"]["receiver"]["cpu_s"] = seconds
+    points = measures.error_over_time(cases, ["receiver"])
+    ber = pytest.approx((5 + 77 / 2) / 770)
+    assert points == {"receiver": [(0.5, ber), (2.0, ber)]}
+    pytest.importorskip("matplotlib")
+    png, svg = tables.plot_error_over_time(points, tmp_path / "files")
+    assert png.read_bytes().startswith(b"\x89PNG")
+    assert "<svg" in svg.read_text()
+
+
 def test_the_headline_puts_receiver_and_yardsticks_side_by_side() -> None:
     record = _record("sky")
     record["ways"]["paper"] = record["ways"]["bound"]

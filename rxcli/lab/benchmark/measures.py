@@ -112,6 +112,15 @@ def reported_payloads(reception: Record) -> set[tuple[int, int, str]]:
     return {(packet["frame"], packet["column"], packet["payload"]) for packet in reception["packets"]}
 
 
+def error_over_time(cases: Sequence[Record], ways: Sequence[str]) -> dict[str, list[tuple[float, float]]]:
+    """Processor seconds and bit error rate of every case whose truth is known, by way."""
+    groups = {way: [Group([case], way, way) for case in cases] for way in ways}
+    return {
+        way: [(group.receptions[0]["cpu_s"], group.score.ber) for group in mine if group.score.ber is not None]
+        for way, mine in groups.items()
+    }
+
+
 def _within(group: Group, sd: float) -> float | None:
     error, stated = group.rows_errors()
     off = (error / stated)[error < ROWS_WILD]

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -80,8 +80,7 @@ def plot(rows: Sequence[Row], path: Path, measure: str, interval: str, across: s
         interval: the column of its intervals.
         across: the column along the other axis.
     """
-    if find_spec("matplotlib") is None:
-        log.warning("no plots: matplotlib is not installed (pip install '.[plot]')")
+    if not _can_plot():
         return
     from matplotlib.figure import Figure
 
@@ -100,3 +99,36 @@ def plot(rows: Sequence[Row], path: Path, measure: str, interval: str, across: s
     axes.set(ylabel=measure, ylim=(0, 1))
     axes.legend(fontsize=8)
     figure.savefig(path, dpi=130)
+
+
+def plot_error_over_time(points: Mapping[str, Sequence[tuple[float, float]]], stem: Path) -> list[Path]:
+    """Draw bit error rate against run time as PNG and SVG; returns where, nothing where matplotlib is not installed.
+
+    Args:
+        points: way -> seconds and bit error rate of every file; a large mark stands for their means.
+        stem: path without suffix.
+    """
+    if not _can_plot():
+        return []
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(6.4, 4.8), layout="constrained")
+    axes = figure.subplots()
+    for number, (way, found) in enumerate(points.items()):
+        seconds, rates = zip(*found, strict=True)
+        axes.plot(seconds, rates, ".", color=f"C{number}", alpha=0.5)
+        axes.plot(sum(seconds) / len(found), sum(rates) / len(found), "o", color=f"C{number}", markersize=11, label=way)
+    axes.set_xscale("log")
+    axes.set_yscale("symlog", linthresh=1e-4)
+    axes.set(xlabel="processor time of a file, s", ylabel="bit error rate, lost packets included", ylim=(-2e-5, 1))
+    axes.legend(fontsize=8, title="mean of all files")
+    paths = [stem.with_name(stem.name + suffix) for suffix in (".png", ".svg")]
+    for path in paths:
+        figure.savefig(path, dpi=130)
+    return paths
+
+
+def _can_plot() -> bool:
+    if find_spec("matplotlib") is None:
+        log.warning("no plots: matplotlib is not installed (pip install '.[plot]')")
+    return find_spec("matplotlib") is not None
