@@ -82,14 +82,22 @@ def test_ci_finds_the_command_that_runs_the_tests() -> None:
     assert line.endswith("-m pytest")
 
 
+def test_the_page_on_integration_names_one_folder() -> None:
+    """The baseline is of the files that the job decodes."""
+    text = (ROOT / "docs" / "ci.md").read_text(encoding="utf-8")
+    assert {name for name in re.findall(r"vlc-rx decode (\S+)", text) if not name.endswith(".jpg")} == {"fixtures"}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PYTHON, ids=lambda page: page.name)
-def test_python_blocks_run(page: Path, desk: Path) -> None:
-    """Each block stands alone."""
+def test_python_blocks_run(page: Path, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each block stands alone, and prints what a comment says that it prints."""
     np.random.seed(0)  # noqa: NPY002  # what a block draws without a seed of its own
     with chdir(desk):
         for number, code in enumerate(blocks(page, "python")):
             exec(compile(code, f"{page.name}, block {number}", "exec"), {"__name__": "__main__"})
+            printed = capsys.readouterr().out
+            assert [line for line in re.findall(r"# prints: (.*)", code) if line not in printed] == []
 
 
 @pytest.mark.slow

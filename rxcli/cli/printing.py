@@ -7,9 +7,9 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 import click
 
@@ -19,6 +19,7 @@ from rxcli.results.summary import SourceSummary, format_clip
 from rxcli.runs.journal import Lines
 from rxcli.types import FrameResult
 
+_T = TypeVar("_T")
 #: Seconds between two lines of progress where stderr is no terminal.
 _EVERY_S = 10.0
 #: Seconds after which a terminal gets a bar.
@@ -133,6 +134,18 @@ def is_terminal(stream: TextIO) -> bool:
 def coloured(text: str, plain: bool = False) -> str:
     """States of frames and columns in their colours."""
     return text if plain else _STATE.sub(lambda found: click.style(found[0], fg=_COLOURS[found[0]]), text)
+
+
+def with_progress(items: Sequence[_T], what: str, unit: str) -> Iterator[_T]:
+    """The items, with progress on stderr: a bar on a terminal, elsewhere a line every ten seconds."""
+    from tqdm import tqdm
+
+    said_s, prints = time.monotonic(), not is_terminal(sys.stderr)
+    for number, item in enumerate(tqdm(items, desc=what, unit=f" {unit}", leave=False, disable=None)):
+        if prints and time.monotonic() - said_s >= _EVERY_S:
+            said_s = time.monotonic()
+            click.echo(f"vlc-rx: {what}: {number} of {len(items)} {unit}", err=True)
+        yield item
 
 
 class Progress:

@@ -16,6 +16,7 @@ import numpy as np
 from rxcli import outputs
 from rxcli.cli.common import claim_outputs, force_argument, options
 from rxcli.cli.kinds import FILE, FOLDER, Exposure
+from rxcli.cli.printing import with_progress
 from rxcli.cli.sending import payload_bytes, sending_of
 from rxcli.errors import UsageError
 from rxcli.lab.simulate.capture import Recording, prepare, write_capture
@@ -242,9 +243,7 @@ def _warn_of_cut_packets(capture: Recording) -> None:
 
 def _write(capture: Recording, out: Path, file_format: str, bit_rate: int | None) -> Path:
     """Write the capture and its truth; returns the truth's path."""
-    from tqdm import tqdm
-
-    progress = partial(tqdm, desc=out.name, unit="frame", leave=False, disable=None)
+    progress = partial(with_progress, what=out.name, unit="frames")
     with outputs.replacing(out) as hidden:
         write_capture(capture, hidden, file_format, bit_rate, progress)
     # The payload of a file of slots is in the truth that `encode` wrote.

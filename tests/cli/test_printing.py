@@ -77,3 +77,11 @@ def test_a_terminal_gets_a_bar_when_there_is_time_to_read_it(
         monkeypatch.setattr(printing, "_DELAY_S", 0.0)
         progress.add(frame(0, 1), last=True)
         assert "2/3" in capsys.readouterr().err
+
+
+def test_a_long_simulation_says_how_far_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(printing, "_EVERY_S", 0.0)
+    assert list(printing.with_progress(range(3), "clip.mp4", "frames")) == [0, 1, 2]
+    assert "vlc-rx: clip.mp4: 2 of 3 frames" in capsys.readouterr().err
