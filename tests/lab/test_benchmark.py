@@ -337,7 +337,13 @@ def test_a_scenario_writes_table_and_journal(tmp_path: Path) -> None:
 def test_drawn_captures_are_saved_with_all_that_is_known(
     more: dict[str, Any], files: list[str], tmp_path: Path
 ) -> None:
-    point = {"screens": ["paper-8k65"], "exposure_slots": [3.0, 3.0], "width_px": [160, 160], **more}
+    point = {
+        "screens": ["paper-8k65"],
+        "exposure_slots": [3.0, 3.0],
+        "width_px": [160, 160],
+        "rows": [0.3, 0.3],
+        **more,
+    }
     task = {"draw": "people", "ways": ["bound"], "seed": 2, "number": 0, "folder": str(tmp_path), "cae": None}
     (record,) = do({**task, "label": "3 slots", "point": point, "save": str(tmp_path)})
     known = json.loads((tmp_path / "3-slots-2-0-0.case.json").read_text())

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import msgspec
 import numpy as np
 import pytest
 import rawpy
@@ -21,6 +22,7 @@ from PIL import Image
 from rxcli.cli.simulate import simulate
 from rxcli.errors import ReceiverError
 from rxcli.ingest import open_source
+from rxcli.lab.simulate.camera import render_band
 from rxcli.lab.simulate.capture import prepare, simulate_frame
 from rxcli.lab.simulate.files import write_dng
 from rxcli.lab.simulate.scenes import PRESETS, Scene, preset
@@ -131,6 +133,32 @@ def test_the_bound_meets_theory_at_moderate_light() -> None:
     rate, theory = wrong / total, float(np.mean(expected))
     assert 0.1 < theory < 0.9
     assert rate == pytest.approx(theory, abs=5 * np.sqrt(theory * (1 - theory) / total) + 0.01)
+
+
+@pytest.mark.parametrize(("exposure_slots", "red_lag_s"), [(3.4, 0.0), (0.7, 6e-4), (5.0, 2e-3)])
+def test_the_bound_counts_all_that_a_slot_does_to_the_sensor(exposure_slots: float, red_lag_s: float) -> None:
+    """Long exposures and red that lags: its information against that of pixels, slot by slot lit alone."""
+    base = preset("phone-plain", "paper-34k6").scaled(0.02, 0.2)
+    screen = msgspec.structs.replace(base.screen, columns=1, width_px=40, height_px=60)
+    sensor = replace(base.sensor, cfa="rgb", row_noise_e=0.0)
+    scene = replace(base, screen=screen, sensor=sensor, picture="gradient", start_slot=300.0, red_lag_s=red_lag_s)
+    scene = replace(scene, exposure_s=exposure_slots / screen.slot_rate_hz)
+    oracle = simulate_frame(scene, 1, oracle=True).oracle
+    assert oracle is not None
+
+    def mean_e(**changes: Any) -> np.ndarray:
+        exposure = prepare(replace(scene, **changes), 1).exposure()
+        return render_band(exposure, 0, sensor.height).mean_e.astype(np.float64)
+
+    def alone(slot: int) -> Any:
+        return lambda slots: (slots == slot).astype(float)
+
+    slots, mean = 310 + np.arange(10), mean_e()
+    variance = mean + sensor.read_noise_e**2 + (sensor.prnu * mean) ** 2
+    effects = np.stack([mean_e(waveform=alone(slot)) - mean_e(waveform=alone(-1)) for slot in slots])
+    expected = np.einsum("sypc,typc->st", effects / variance, effects)
+    found = oracle.about_slots(0, 310)[1]
+    np.testing.assert_allclose(found, expected, atol=0.02 * np.abs(expected).max())
 
 
 def test_command_writes_capture_and_truth(tmp_path: Path) -> None:
