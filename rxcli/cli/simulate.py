@@ -55,6 +55,13 @@ _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_ra
     ("--format=NAME file_format", _FORMATS, None, f"Format of OUT, {', '.join(_FORMATS)}. [default: by its suffix]"),
     ("--w weights", str, "5", "Lit slots of ten: N, a list N,N,..., or 'dimming'."),
     ("--exposure exposure_s", Exposure(), None, "Exposure in seconds, or as 1/32000.  [default: the preset's]"),
+    (
+        "--exposure-slots",
+        click.FloatRange(0, min_open=True),
+        None,
+        "Exposure in slots; the gain follows, as in camera apps.",
+    ),
+    ("--readout readout_s", click.FloatRange(0, min_open=True), None, "Seconds in which all rows are read."),
     ("--electrons", float, None, "Electrons of a green pixel that sees white, in one exposure."),
     ("--roll roll_deg", float, None, "Degrees about the line of sight; 180 for a camera upside down."),
     ("--fill", float, None, "Share of the picture's width that the screen fills, instead of a distance."),
@@ -140,6 +147,10 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
         sent["waveform"] = _waveform(options, scene.screen)
     scene = replace(scene, w=_weights(options["weights"]), **sent, **_given(options, _SCENE_OPTIONS))
     scene = _with_pose(scene, options)
+    if options["readout_s"] is not None:
+        scene = scene.read_in(options["readout_s"])
+    if options["exposure_slots"] is not None:
+        scene = scene.metered(options["exposure_slots"] / scene.screen.slot_rate_hz)
     if options["exposure_s"] is not None:
         scene = replace(scene, exposure_s=options["exposure_s"])
     if options["electrons"] is not None:

@@ -178,6 +178,11 @@ def test_command_writes_capture_and_truth(tmp_path: Path) -> None:
     assert changed.exit_code == 0, changed.output
     other = json.loads((tmp_path / "b.truth.json").read_text())
     assert (other["camera"]["name"], other["camera"]["dist_coeffs"][0], other["orientation"]) == ("mine", 0.1, 8)
+    quick = run(str(tmp_path / "c.jpg"), *SMALL, "--readout", "5e-3", "--exposure-slots", "4")
+    assert quick.exit_code == 0, quick.output
+    camera = json.loads((tmp_path / "c.truth.json").read_text())["camera"]
+    assert camera["line_delay_s"] * camera["height"] == pytest.approx(5e-3, rel=1e-3)
+    assert camera["exposure_s"] == pytest.approx(4 / 34600)
     first = out.read_bytes()
     run(str(out), *SMALL, "--start-slot", "20", "--payload", "hex:00ff", "--w", "4", "--roll", "180")
     assert out.read_bytes() == first
