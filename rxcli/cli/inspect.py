@@ -94,10 +94,10 @@ def write_page(
     from rxcli.results.cameras import camera_of, screen_of
     from rxcli.results.page import inspection_page
 
-    results, picture = _received(path, frame, options, truth)
+    results, picture, taps = _received(path, frame, options, truth)
     shown = next(result for result in results if result.frame == picture.index)
     screen, camera = screen_of(shown, options.screens), camera_of(picture, shown, options.cameras)
-    text = inspection_page(picture, shown, screen, camera, results if len(results) > 1 else [])
+    text = inspection_page(picture, shown, screen, camera, taps, results if len(results) > 1 else [])
     claim_own_folder("--out", page.parent, (page.name,), force)
     write_whole(page, text)
     return results
@@ -110,13 +110,14 @@ def _stem(path: str) -> str:
 
 def _received(
     path: str, number: int | None, options: ReceiverOptions, truth: str | None
-) -> tuple[list[FrameResult], Frame]:
-    """Receive the frames of a source; also return the frame to show.
+) -> tuple[list[FrameResult], Frame, dict[str, Any] | None]:
+    """Receive the frames of a source; also return the frame to show, and its arrays at the stage boundaries.
 
     Raises:
         InputError: the source cannot be read, or has no such frame.
     """
     from rxcli.ingest import open_source
+    from rxcli.receiver.receive import receive
     from rxcli.results.truth import Scorer, load_truth, truth_for
     from rxcli.runs.batch import standard_decoder
 
@@ -125,10 +126,17 @@ def _received(
     n_frames = max(_MAX_FRAMES, (number or 0) + 1)
     frames, decoder = islice(open_source(path), n_frames), standard_decoder(options)
     head = list(islice(frames, 1))  # so that a photo is read once
-    received = list(decoder.linked(decoder.receive(chain(head, frames), options)))
-    results = [scorer.add(result) if scorer else result for result in received]
-    best = max(results, key=lambda result: len(result.packets), default=None)
-    if best is None or (number is not None and number >= len(results)):
+    pending: dict[int, dict[str, Any]] = {}
+    results: list[FrameResult] = []
+    best, taps = None, None
+    received = receive(chain(head, frames), options, lambda _, frame, stages: pending.update({frame: stages}))
+    for each in decoder.linked(received):
+        results.append(scorer.add(each) if scorer else each)
+        arrays = pending.pop(each.frame, None)
+        is_better = best is None or len(each.packets) > len(best.packets)
+        if is_better if number is None else each.frame == number:
+            best, taps = each, arrays
+    if best is None:
         raise InputError(f"{path}: has no frame {number or 0}", "choose a lower --frame")
-    shown = best.frame if number is None else number
-    return results, head[0] if shown == 0 else next(islice(open_source(path), shown, None))
+    shown = best.frame
+    return results, head[0] if shown == 0 else next(islice(open_source(path), shown, None)), taps

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.profiles import CameraProfile, ScreenProfile
-from rxcli.protocol import bits_per_symbol, encode_packet, hex_to_bits
-from rxcli.receiver import camera as blind
-from rxcli.receiver import plane
-from rxcli.receiver.decode import assemble
-from rxcli.receiver.plane.orientation import as_received
-from rxcli.results.overlay import outlines_of
-from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, RowProfiles
+from rxcli.receiver.light import SlotLight
+from rxcli.types import Clock, ColumnResult, FloatArray, FrameResult, RowProfiles
 
 #: Slots over which a column's picture is taken for even, and over which one clock residual is measured.
 _PICTURE_SLOTS, _RESIDUAL_SLOTS = 40, 30
@@ -24,6 +18,8 @@ _PICTURE_SLOTS, _RESIDUAL_SLOTS = 40, 30
 BINS, EYE_TIMES = 40, 40
 #: Light relative to that of a lit slot, from and to.
 RANGE = (-0.4, 1.6)
+#: Share of an exposure in decided slots from which a row is compared with them.
+_ALL = 0.999
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,54 +56,61 @@ class Inspection:
     crosstalk: FloatArray
 
 
-def inspect_frame(
-    frame: Frame, result: FrameResult, screen: ScreenProfile, camera: CameraProfile | None
-) -> Inspection | None:
-    """Light of every column against its decided slots; None where no clock is known.
+def inspect_frame(taps: Mapping[str, Any], result: FrameResult) -> Inspection:
+    """Light of every column against its decided slots.
 
     Args:
-        frame: the picture.
-        result: what became of it; its corners are known.
-        screen: the profile that it names.
-        camera: the profile that it names, or the estimated one.
+        taps: arrays at the stage boundaries of the frame, see `receive`.
+        result: what became of it.
     """
-    frame, result = as_received(frame, result)
-    if result.corners is None or not result.line_delay_s or not result.columns:
-        return None
-    width_px = float(np.linalg.norm(result.corners[1] - result.corners[0])) / screen.columns
-    outlines = outlines_of(result.corners, screen.columns, frame, camera, plane.strips_per_column(width_px))
-    tone = "srgb" if camera is None or camera.tone == "auto" else camera.tone
-    profiles, columns = _in_time_order(frame, result, plane.sample_rows(plane.read_plane(frame), outlines, tone))
-    rows_per_slot = 1 / (screen.slot_rate_hz * result.line_delay_s)
-    exposure_rows = (result.exposure_s or 0.0) / result.line_delay_s
-    traces = [_trace(profiles, column, screen, rows_per_slot, exposure_rows) for column in columns]
-    eye = _eye(traces, rows_per_slot)
-    return Inspection(rows_per_slot, tuple(traces), _histogram(traces), eye, _crosstalk(traces))
+    clock: Clock = taps["clock"]
+    profiles, lit = _profiles(taps), _lit(taps, clock)
+    traces = []
+    for column in result.columns:
+        own = -1 - column.column if result.mirrored else column.column
+        slots = lit[own] if column.packets else np.full(clock.n_slots, np.nan)
+        start = clock.row0 + float(clock.delay_slots[own]) * clock.rows_per_slot
+        traces.append(_trace(column, *_column_light(profiles, own), slots, replace(clock, row0=start)))
+    eye = _eye(traces, clock.rows_per_slot)
+    return Inspection(clock.rows_per_slot, tuple(traces), _histogram(traces), eye, _crosstalk(traces))
 
 
-def _trace(
-    profiles: RowProfiles, column: ColumnResult, screen: ScreenProfile, rows_per_slot: float, exposure_rows: float
-) -> Trace:
-    rows, light = column_light(profiles, column.column)
+def _profiles(taps: Mapping[str, Any]) -> RowProfiles:
+    """The sampled rows of a frame, tracked or not."""
+    if "sampling" in taps:
+        return cast("RowProfiles", taps["sampling"])
+    light, inside, rows = (taps[f"sampling.{name}"] for name in ("light", "inside", "rows"))
+    return RowProfiles(light, inside, rows, None, inside.sum(axis=2), 0.0, 0.0)
+
+
+def _lit(taps: Mapping[str, Any], clock: Clock) -> FloatArray:
+    """(C, N) 1 where a slot was decided as lit, 0 as dark; NaN where its burst goes on in the next frame."""
+    if "detect" in taps:
+        return np.asarray(clock.on_grid(taps["detect"].lit) > 0.5, np.float64)
+    ended = {number: taps.get(f"detect.{number}") for number in taps["bursts.number"].tolist()}
+    unknown = np.full((len(taps["channel.metrics"]), clock.packet_slots), np.nan, np.float32)
+    bursts = [unknown if posteriors is None else np.round(posteriors.lit[0]) for posteriors in ended.values()]
+    return np.asarray(clock.on_grid(np.stack(bursts)), np.float64)
+
+
+def _trace(column: ColumnResult, rows: FloatArray, light: FloatArray, slots: FloatArray, clock: Clock) -> Trace:
+    """Light of a column on its rows (n,) and what its slots (N,) explain of it; `clock` is the column's."""
     order = np.argsort(rows, kind="stable")
-    rows, light = rows[order], light[order]
-    unknown = np.full(rows.size, np.nan)
-    share, borders, spans = unknown.copy(), [], []
-    for start, slots in decided_slots(column, screen, rows_per_slot, rows):
-        borders.append(start)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], slots, [0]]))).reshape(-1, 2)
-        # A row shows most of a slot where its exposure is half over.
-        spans += [(start + rows_per_slot * float(a), start + rows_per_slot * float(b)) for a, b in edges - 0.0]
-        total = np.concatenate([[0.0], np.cumsum(slots)])
-        grid = np.arange(slots.size + 1, dtype=np.float64)
-        start_slots = (rows - start) / rows_per_slot
-        length = max(exposure_rows, 1.0) / rows_per_slot
-        inside = (start_slots >= 0) & (start_slots + length <= slots.size)
-        lit = np.interp(start_slots + length, grid, total) - np.interp(start_slots, grid, total)
-        share[inside] = lit[inside] / length
-    spans = [(a - exposure_rows / 2, b - exposure_rows / 2) for a, b in spans]
-    trace = Trace(column, rows, light, unknown, share, unknown, tuple(borders), tuple(spans))
-    return _with_model(trace, rows_per_slot) if borders and np.isfinite(share).sum() > 3 * rows_per_slot else trace
+    rows, light, unknown = rows[order], light[order], np.full(rows.size, np.nan)
+    known = np.isfinite(slots)
+    if not known.any():
+        return Trace(column, rows, light, unknown, unknown, unknown)
+    exposed = SlotLight(np.stack([np.where(known, slots, 0.0), known]).astype(np.float32)).mean_over(
+        ((rows - clock.row0) / clock.rows_per_slot)[None], clock.exposure_slots
+    )
+    share = np.where(exposed[1] > _ALL, exposed[0], np.nan).astype(np.float64)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], slots == 1, [0]]))).reshape(-1, 2)
+    spans = clock.row0 + edges * clock.rows_per_slot
+    starts = np.flatnonzero(np.diff(clock.burst, prepend=-1)) * clock.packet_slots - clock.first_slot
+    shown = [start for start in starts.tolist() if known[np.clip(start, 0, known.size - 1)]]
+    borders = clock.row0 + (np.array(shown) + clock.exposure_slots / 2) * clock.rows_per_slot
+    trace = Trace(column, rows, light, unknown, share, unknown, tuple(borders.tolist()), tuple(map(tuple, spans)))
+    return _with_model(trace, clock.rows_per_slot)
 
 
 def _with_model(trace: Trace, rows_per_slot: float) -> Trace:
@@ -190,43 +193,10 @@ def _on(rows: FloatArray, trace: Trace) -> FloatArray:
     return np.asarray(np.interp(rows, trace.rows, trace.share, left=np.nan, right=np.nan))
 
 
-def _in_time_order(
-    frame: Frame, result: FrameResult, profiles: RowProfiles
-) -> tuple[RowProfiles, tuple[ColumnResult, ...]]:
-    """Row profiles and columns with rows counted as they were read out, not as software may have turned them."""
-    if not result.estimated.get("readout_reversed", (0.0, 0.0))[0]:
-        return profiles, result.columns
-    columns = tuple(assemble.in_stored_rows(column, frame.height) for column in result.columns)
-    return blind.in_time_order(profiles, frame.height), columns
-
-
-def column_light(profiles: RowProfiles, column: int) -> tuple[FloatArray, FloatArray]:
+def _column_light(profiles: RowProfiles, column: int) -> tuple[FloatArray, FloatArray]:
     """Sensor rows (n,) and mean light (n,) of one column, where it is on the screen."""
     inside = profiles.inside[column]
     on_screen = inside.any(axis=0)
     light = (profiles.light[column] * inside).sum(axis=0)[on_screen] / inside.sum(axis=0)[on_screen]
     rows = profiles.rows.astype(np.float64) if profiles.sensor_row is None else profiles.sensor_row[column].mean(axis=0)
     return rows[on_screen], light.astype(np.float64)
-
-
-def decided_slots(
-    column: ColumnResult, screen: ScreenProfile, rows_per_slot: float, rows: FloatArray
-) -> Iterator[tuple[float, NDArray[np.uint8]]]:
-    """Decided slots of each packet of a column, over the copies that are visible on its sensor rows (n,).
-
-    Yields:
-        Sensor row where the first slot starts, and the slots, 0 or 1.
-    """
-    if column.w is None or rows.size == 0 or not column.packets:
-        return
-    ends = [packet.first_row for packet in column.packets[1:]] + [float(rows.max())]
-    for packet, end in zip(column.packets, ends, strict=True):
-        if packet.payload_bits != bits_per_symbol(column.w) * screen.payload_symbols:
-            continue  # no packet of this weight and screen
-        slots = encode_packet(hex_to_bits(packet.payload, packet.payload_bits), column.w)
-        # After the counted copies another burst may begin that is hardly visible.
-        hidden = max(float(rows.min()) - packet.first_row, 0.0) / rows_per_slot
-        longest = min(hidden + packet.copies * slots.size, screen.repeats * slots.size)
-        n_slots = math.ceil(min((end - packet.first_row) / rows_per_slot, longest))
-        if n_slots > 0:
-            yield packet.first_row, np.resize(slots, n_slots)

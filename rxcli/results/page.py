@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ def inspection_page(
     result: FrameResult,
     screen: ScreenProfile | None,
     camera: CameraProfile | None,
+    taps: Mapping[str, Any] | None,
     timeline: Sequence[FrameResult] = (),
 ) -> str:
     """The page of a frame.
@@ -45,9 +46,10 @@ def inspection_page(
         result: what became of it.
         screen: the profile that `result` names.
         camera: the profile that `result` names, or the estimated one.
+        taps: arrays at its stage boundaries, see `rxcli.receiver.receive.receive`; None where reception ended before.
         timeline: results of all frames of the clip that it is of.
     """
-    known = inspect_frame(frame, result, screen, camera) if screen is not None else None
+    known = inspect_frame(taps, result) if taps and result.columns else None
     reason, advice = split_message(result) if result.message else ("", "")
     data = {
         "headline": headline(result),

@@ -16,13 +16,9 @@ from small_frames import BOTTOM, N_COLUMNS, ROWS_PER_SLOT, TOP, write_frame, wri
 from rxcli.cli.main import run
 from rxcli.ingest import open_source
 from rxcli.options import ReceiverOptions, receiver_options
-from rxcli.profiles import ScreenProfile, load_profile
-from rxcli.protocol import bits_per_symbol
 from rxcli.receiver.receive import receive
-from rxcli.results.cameras import camera_of
-from rxcli.results.inspection import Inspection, decided_slots, inspect_frame
+from rxcli.results.inspection import Inspection, inspect_frame
 from rxcli.runs.batch import collect_sources
-from rxcli.types import ColumnResult, PacketResult
 
 
 def shown(page: Path) -> dict[str, Any]:
@@ -35,11 +31,9 @@ def shown(page: Path) -> dict[str, Any]:
 
 def inspected(path: Path, options: ReceiverOptions) -> Inspection:
     """The analysis of a photo that is received."""
-    [frame] = open_source(path)
-    [result] = receive([frame], options)
-    known = inspect_frame(frame, result, options.screens[0], camera_of(frame, result, options.cameras))
-    assert known is not None
-    return known
+    taps: dict[str, Any] = {}
+    [result] = receive(open_source(path), options, lambda _, __, stages: taps.update(stages))
+    return inspect_frame(taps, result)
 
 
 SAMPLE = Path(__file__).parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
@@ -159,28 +153,14 @@ def test_failures_are_one_line(
     assert captured.err.count("\n") == 1
 
 
-def test_slots_are_told_for_the_copies_in_view_and_not_for_what_follows() -> None:
-    """Behind them a burst may begin of which too little is seen to say anything."""
-    screen = load_profile("paper-17k3", ScreenProfile)
-    n_slots = 20 + 10 * screen.payload_symbols
-    bits = bits_per_symbol(5) * screen.payload_symbols
-    payload = "00" * ((bits + 7) // 8)
-    rows = np.arange(100.0, 4000.0)
-    for first_row, copies, expected in ((100.0, 1.5, 1.5 * n_slots), (50.0, 1.5, 1.5 * n_slots + 10)):
-        packet = PacketResult(first_row, copies, bits, payload, 0.9, 0.01)
-        [(start, slots)] = decided_slots(ColumnResult(0, "ok", w=5, packets=(packet,)), screen, 5.0, rows)
-        assert start == first_row
-        assert slots.size == pytest.approx(expected, abs=1)
-
-
-@pytest.mark.parametrize("turned", [False, True])
-def test_slots_of_an_unknown_camera_lie_along_bent_stripes(turned: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("turned", "mirrored"), [(False, False), (True, False), (False, True)])
+def test_slots_of_an_unknown_camera_lie_along_bent_stripes(turned: bool, mirrored: bool, tmp_path: Path) -> None:
     import cv2
 
     stored = cv2.imread(str(SAMPLE), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(tmp_path / "phone.png"), stored[::-1, ::-1] if turned else stored)
     agreement = []
-    for trace in inspected(tmp_path / "phone.png", receiver_options(screens=("paper-17k3",))).traces:
+    for trace in inspected(tmp_path / "phone.png", receiver_options(screens=("paper-17k3",), mirrored=mirrored)).traces:
         good = np.isfinite(trace.relative) & np.isfinite(trace.share)
         agreement.append(np.corrcoef(trace.light[good], trace.share[good])[0, 1])
     assert len(agreement) >= 18
