@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_scene import scene
 
-from rxcli.errors import OutputError
+from rxcli.errors import UsageError
 from rxcli.lab.benchmark.trial import Trial, frame_of
 from rxcli.lab.simulate.capture import prepare
 from rxcli.protocol import hex_to_bits, indices_to_bits
@@ -61,5 +61,5 @@ def test_what_is_unknown_is_left_out(tmp_path: Path) -> None:
     assert path.name == "x-000007.npz"
     with np.load(path) as taps:
         assert taps.files == ["b.c"]
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(UsageError, match="cannot be written"):
         dump_stages(path, "x", 0, {})
