@@ -79,7 +79,9 @@ def _chosen(name: str, captures: Path | None, only: tuple[str, ...], ways: tuple
             if choice not in known:
                 raise click.BadParameter(f"{choice!r} is not one of {', '.join(known)}")
     points = {label: point for label, point in points.items() if not only or label in only}
-    return msgspec.structs.replace(scenario, points=points, ways=ways or scenario.ways)
+    ways = ways or scenario.ways
+    beside = scenario.beside if scenario.beside in ways else None
+    return msgspec.structs.replace(scenario, points=points, ways=ways, beside=beside)
 
 
 def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given: Any) -> int:

@@ -390,6 +390,12 @@ def test_packets_of_earlier_journals_are_in_the_bins(tmp_path: Path) -> None:
     assert counts[1] == counts[0] + 2
 
 
+def test_a_way_alone_is_compared_with_none(tmp_path: Path) -> None:
+    arguments = ["sweep-light", "--only", "x 1", "--way", "paper", "--count", "1", "--out", str(tmp_path), "--quiet"]
+    assert CliRunner().invoke(benchmark, arguments).exit_code == 0
+    assert "share" not in json.loads((tmp_path / "sweep-light.json").read_text())["rows"][0]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
