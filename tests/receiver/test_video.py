@@ -212,9 +212,9 @@ def test_products_take_one_thread_while_a_frame_is_received(clip: Clip, monkeypa
     def threads() -> list[int]:
         return [library["num_threads"] for library in blas.info() if _is_numpys(library)]
 
-    def step(state: object, _frame: Frame) -> tuple[object, list[object]]:
+    def step(state: object, frame: Frame) -> tuple[object, list[FrameResult]]:
         inside.append(threads())
-        return state, [None]
+        return state, [FrameResult(frame.source, 0, 0.0, "no_screen")]
 
     monkeypatch.setattr("rxcli.receiver.clip.receiver.step", step)
     with blas.limit(limits=2, user_api="blas"):
