@@ -166,10 +166,15 @@ def _content(container: Any, stream: Any, progress: _Progress) -> Iterator[Any]:
     """Packets up to the end or a fault, but for empty ones, which stand for frames that a camera dropped."""
     import av
 
-    try:
-        yield from (packet for packet in container.demux(stream) if packet.size)
-    except av.error.FFmpegError:
-        progress.cut = True
+    is_on = True
+    while is_on:
+        try:
+            yield from (packet for packet in container.demux(stream) if packet.size)
+            is_on = False
+        except IndexError:  # a packet of a stream that begins within the file, which PyAV does not know
+            continue
+        except av.error.FFmpegError:
+            progress.cut, is_on = True, False
 
 
 def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:

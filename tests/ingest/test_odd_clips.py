@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -286,6 +287,21 @@ def test_one_bound_whatever_the_cores(
     frames, error = read_all(tmp_path / "a.mp4")
     assert len(frames) == (N_FRAMES if is_read else 0)
     assert is_read or "160 x 96 pixels would take" in str(error)
+
+
+def test_streams_that_begin_within_a_file_are_passed_over() -> None:
+    """PyAV does not know them, and ends with an error."""
+    packets = iter([*"ab", IndexError(), *"cd"])
+
+    def demux(_: object) -> Iterator[SimpleNamespace]:
+        for packet in packets:
+            if isinstance(packet, IndexError):
+                raise packet
+            yield SimpleNamespace(size=1, name=packet)
+
+    progress = video._Progress()
+    found = video._content(SimpleNamespace(demux=demux), None, progress)
+    assert ("".join(packet.name for packet in found), progress.cut) == ("abcd", False)
 
 
 def times_of(stamps: list[float | None]) -> list[tuple[float, bool]]:
