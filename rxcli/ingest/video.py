@@ -185,12 +185,16 @@ def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Ite
     # HEVC's decoder passes over faults otherwise.
     codec.options = {"max_pixels": str(max_pixels)} | ({"err_detect": "explode"} if codec.name == "hevc" else {})
     whole = WholeFrames(codec, n_threads, n_frames - _N_HELD - n_threads)
-    for packet, has_gap in _packets(container, stream, progress):
-        for frame in whole.decode(packet, has_gap=has_gap):
-            if frame is None:
-                progress.damage()
-            else:
-                yield from _fields(_frame(path, frame, stream, progress), frame, stream, progress)
+    try:
+        for packet, has_gap in _packets(container, stream, progress):
+            for frame in whole.decode(packet, has_gap=has_gap):
+                if frame is None:
+                    progress.damage()
+                else:
+                    yield from _fields(_frame(path, frame, stream, progress), frame, stream, progress)
+    finally:
+        # Threads at work may wait for this one, which would wait for them when it frees the decoder.
+        codec.flush_buffers()
 
 
 def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
