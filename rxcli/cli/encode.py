@@ -18,11 +18,19 @@ from rxcli.cli.common import claim_outputs, force_argument, options, refuse
 from rxcli.cli.kinds import FILE
 from rxcli.cli.sending import LIGHT, raw_sending, sending_of
 from rxcli.errors import InputError, UsageError
-from rxcli.link.encoder import FileSending, Sending, TestLight, packet_slots_of, payload_hex, visible_bits_of_burst
+from rxcli.link.encoder import (
+    TEST_LIGHT_SLOTS,
+    FileSending,
+    Sending,
+    TestLight,
+    packet_slots_of,
+    payload_hex,
+    visible_bits_of_burst,
+)
 from rxcli.link.slots import WITHOUT_TEXT, WRITERS, bytes_per_row, order_of, write_slots
 from rxcli.outputs import ENCODED, TRUTH, Output, write_whole
 from rxcli.profiles import ScreenProfile, load_profile
-from rxcli.protocol import SLOTS_PER_SYMBOL, payload_bits
+from rxcli.protocol import payload_bits
 from rxcli.results.report import plural
 
 _RATES = {"1/1.5": 0, "1/2": 1, "1/3": 2}
@@ -212,7 +220,7 @@ class _Plan:
     def _slots_of_all(self) -> Iterator[NDArray[np.uint8]]:
         columns, repeats = self.screen.columns, self.screen.repeats
         if isinstance(self.sending, TestLight):
-            lit = np.arange(self.n_bursts * self.burst_slots) % SLOTS_PER_SYMBOL < self.sending.n_lit
+            lit = np.arange(self.n_bursts * self.burst_slots) % TEST_LIGHT_SLOTS < self.sending.n_lit
             yield np.repeat(lit[:, None], columns, axis=1).astype(np.uint8)
             return
         for start, labels in self._chunks():

@@ -14,8 +14,8 @@ from rxcli.link.formats import MAX_MESSAGE_BYTES
 #: Name under which a text goes that is too long for a message.
 _TEXT_NAME = "message.txt"
 _MAX_FILE_BYTES = 1 << 30
-#: Lit slots of ten of payloads without packets.
-LIGHT = {"lit": 10, "half": 5}
+#: Lit slots of four of payloads without packets.
+LIGHT = {"lit": 4, "half": 2}
 
 
 def sending_of(

@@ -31,6 +31,8 @@ _LABEL_WEIGHTS = 1 << np.arange(LABEL_BITS - 1, -1, -1)
 _BATCH = 64
 #: Bursts of random payload or of a counter, unless more are asked for.
 _RAW_BURSTS = 64
+#: Period of light without packets.
+TEST_LIGHT_SLOTS = 4
 
 Labels = NDArray[np.uint8]
 
@@ -244,7 +246,7 @@ class RawSending:
 
 @dataclass(frozen=True, slots=True)
 class TestLight:
-    """Light without packets: of every ten slots some lit ones, then dark ones."""
+    """Light without packets: of every four slots some lit ones, then dark ones."""
 
     n_lit: int
 
@@ -252,13 +254,13 @@ class TestLight:
         """Light needs no bits."""
 
     def usual_bursts(self, columns: int, payload_symbols: int) -> int:
-        """One: it is the same all the time."""
-        return 1
+        """Two, which have a multiple of four slots on any screen."""
+        return 2
 
     @property
     def summary(self) -> str:
         """One line for people."""
-        return f"light without packets, {self.n_lit} of ten slots lit"
+        return f"light without packets, {self.n_lit} of four slots lit"
 
 
 #: A continuous transmission.

@@ -221,14 +221,20 @@ class Scorer:
 
     def _shown(self, result: FrameResult) -> tuple[int, ...]:
         """Bursts of a transmission with which the packets of a frame agree, all columns together."""
-        agreement = dict.fromkeys(self._distinct, 0.0)
+        agreement, packets = dict.fromkeys(self._distinct, 0.0), []
         for column in result.columns:
-            for packet in column.packets:
-                for burst in self._distinct if column.column < self._truth.columns else ():
+            for packet in column.packets if column.column < self._truth.columns else ():
+                bits = {}
+                for burst in self._distinct:
                     errors, n_bits = self._errors(packet, column.column, burst)
-                    agreement[burst] += max(MAX_WRONG_SHARE * n_bits - errors, 0.0)
-        enough = max(max(agreement.values(), default=0.0) * _ALSO_SHOWN, 1e-9)
-        return tuple(burst for burst, bits in agreement.items() if bits >= enough)
+                    if errors <= MAX_WRONG_SHARE * n_bits:
+                        bits[burst] = n_bits - errors
+                        agreement[burst] += MAX_WRONG_SHARE * n_bits - errors
+                packets.append(bits)
+        enough = _ALSO_SHOWN * max(agreement.values(), default=0.0)
+        # Each packet is of one burst: those of a counter differ in few bits.
+        likely = [{burst: n for burst, n in bits.items() if agreement[burst] >= enough} for bits in packets]
+        return tuple({max(bits, key=lambda burst: (bits[burst], agreement[burst])) for bits in likely if bits})
 
     def _errors(self, packet: PacketResult, column: int, burst: int) -> tuple[int, int]:
         """Wrong bits of a packet if it is that of a burst, and the bits of the longer of both."""

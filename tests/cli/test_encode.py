@@ -180,7 +180,7 @@ def test_raw_payload_is_what_the_simulator_sends(tmp_path: Path, content: str) -
 
 @pytest.mark.parametrize(
     ("what", "lit"),
-    [(("counter",), None), (("hex:cafe", "--same"), None), (("lit",), 10), (("half",), 5), (("random",), None)],
+    [(("counter",), None), (("hex:cafe", "--same"), None), (("lit",), 4), (("half",), 2), (("random",), None)],
     ids=lambda value: value[0] if isinstance(value, tuple) else "",
 )
 def test_first_light_is_the_same_in_all_columns_or_in_one(
@@ -192,7 +192,7 @@ def test_first_light_is_the_same_in_all_columns_or_in_one(
     slots = read_slots(out, screen)
     assert (slots == slots[:, :1]).all() == (what != ("random",))
     if lit is not None:
-        assert np.array_equal(slots[:, 0], np.arange(3 * 130) % 10 < lit)
+        assert np.array_equal(slots[:, 0], np.arange(3 * 130) % 4 < lit)
     if what == ("counter",):
         words = codebook(5).tolist()
         packet = [words.index(word.tolist()) for word in slots[130:260, 0].reshape(13, 10)[2:]]

@@ -192,6 +192,14 @@ def test_the_packets_of_a_frame_find_its_bursts_in_a_transmission(
     assert scorer.score() == expected
 
 
+def test_bursts_of_a_counter_differ_in_few_bits() -> None:
+    """One burst is expected, not all that are like it."""
+    numbers = {str(burst): [f"{burst:010x}"] * 2 for burst in range(8)}
+    scorer = Scorer(truth(frames=[], payload=numbers))
+    scorer.add(frame(0, [(0, numbers["5"][0]), (1, numbers["5"][1])]))
+    assert scorer.score() == Score(2, 80, error_free=2)
+
+
 def test_dark_columns_of_a_transmission_are_not_expected() -> None:
     scorer = Scorer(truth(frames=[], payload_bits=[N_BITS, 0], payload={"0": ["0000000000", ""]}))
     scorer.add(frame(3, [(0, "0000000000")]))

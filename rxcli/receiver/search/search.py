@@ -59,12 +59,18 @@ def search(
         outlines = screens[0]
     found = _search(cache, options, known, outlines, budget)
     packets = _packet_evidence(found)
-    if options.corners is not None or outlines[0].family < 0 or (packets and outlines[0].stands_out):
+    if outlines[0].family < 0 or (packets and outlines[0].stands_out):
         return found
     without = without_borders(cache)
     if not without:
         return found
     borderless = _search(cache, options, known, without, budget)
+    if options.corners is not None:
+        if isinstance(borderless, Failure) or not _packet_evidence(borderless):
+            return found
+        # Of one column that sends alone, its own rows give the camera, and the corners its number.
+        numbered_by_corners = _search(cache, options, borderless.best.context, outlines, budget)
+        return numbered_by_corners if _packet_evidence(numbered_by_corners) else found
     is_steady = isinstance(borderless, Failure) and borderless.message == STEADY_LIGHT and not packets
     return borderless if is_steady or _packet_evidence(borderless) > SETTINGS.borderless_gain * packets else found
 
