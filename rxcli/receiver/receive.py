@@ -29,11 +29,6 @@ from rxcli.receiver.still import apply_autoencoder, decode_photograph
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Frame, FrameResult, OnTaps
 
-_COUNTED_FROM_LEFT = (
-    "no side of the screen is in view: columns are counted from the leftmost visible one; take one side into view to "
-    "have the screen's numbers"
-)
-
 
 def receive(frames: Iterable[Frame], options: ReceiverOptions, on_taps: OnTaps | None = None) -> Iterator[FrameResult]:
     """Receive the frames of one source; yields one result per frame, in order.
@@ -156,9 +151,18 @@ def _receive_screen(
     )
     if result.status == "no_signal":
         result = replace(result, message=too_small(context, acquisition.screen) or assemble.why_no_packet(columns))
-    elif outline.is_counted_from_left:
-        result = replace(result, message=_COUNTED_FROM_LEFT)
+    elif outline.column_offset is None:
+        result = replace(result, message=numbered_from_left(result))
     return Received(result, _taps(found, reception))
+
+
+def numbered_from_left(result: FrameResult) -> str:
+    """What the numbers of the columns are worth where the screen's first is not sure."""
+    leftmost = next((column.column for column in result.columns if column.packets), 0)
+    return (
+        f"columns numbered from the leftmost that was seen: it is the screen's column {leftmost} with a probability of "
+        f"{result.column_certainty:.2f}; take one side of the screen into view to have the screen's numbers"
+    )
 
 
 def _taps(found: Found, reception: Reception) -> dict[str, Any]:

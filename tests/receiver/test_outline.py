@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,13 +11,15 @@ from numpy.typing import NDArray
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.result import Received
+from rxcli.receiver.receive import numbered_from_left
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.grid import grid_between
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search.numbers import numbered
 from rxcli.receiver.search.outlines import possible_screens
 from rxcli.receiver.search.propose import likeliest_of_family
-from rxcli.types import FloatArray, Frame
+from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, PacketResult
 
 HEIGHT, WIDTH, ROWS_PER_SLOT, COLUMNS = 1600, 1200, 10.0, 20
 CORNERS = np.array([[150.0, 320.0], [1105.0, 290.0], [1130.0, 880.0], [120.0, 850.0]])
@@ -76,7 +80,6 @@ def test_a_screen_larger_than_the_picture_has_its_columns_counted_from_the_left_
     [candidates] = possible_screens(FrameCache(Frame(drawn(0, 20, LARGE), "drawn")), OPTIONS)
     best = likeliest(candidates)
     assert best.column_offset is None
-    assert best.is_counted_from_left
     assert -60 < best.corners[0, 0] < 20
     # Borders of columns lie where they are, by whatever number.
     grid = grid_between(LARGE, COLUMNS, (WIDTH, HEIGHT), None)
@@ -88,7 +91,7 @@ def test_a_side_in_view_tells_the_columns_of_a_screen_that_goes_on_outside_the_p
     corners = LARGE + np.array([300.0, 0.0])
     [candidates] = possible_screens(FrameCache(Frame(drawn(0, 20, corners), "drawn")), OPTIONS)
     best = likeliest(candidates)
-    assert best.column_offset == 0
+    assert best.certainty > 0.8
     assert abs(float(grid_between(corners, COLUMNS, (WIDTH, HEIGHT), None).columns_at(best.corners)[0])) < 0.3
 
 
@@ -111,3 +114,18 @@ def test_columns_are_said_to_be_the_screens_only_where_that_is_sure(odds: float,
     best = likeliest([Outline(CORNERS, log_odds=odds), Outline(moved(1))])
     assert best.column_offset == offset
     np.testing.assert_array_equal(best.corners, CORNERS)
+
+
+def of_doubtful_number(certainty: float) -> FrameResult:
+    """A packet in column 3 that is right, if that is its column."""
+    packet = PacketResult(0.0, 1.0, 7, "00", confidence=0.97 * certainty, ber_hat=0.0)
+    columns = (ColumnResult(2, "dark"), ColumnResult(3, "ok", w=5, packets=(packet,)))
+    return FrameResult("drawn", 0, 0.0, "ok", columns=columns, column_certainty=certainty, column_offset=None)
+
+
+def test_a_doubtful_number_is_stated_and_asks_for_no_other_camera() -> None:
+    message = numbered_from_left(of_doubtful_number(0.3))
+    assert "numbered from the leftmost that was seen: it is the screen's column 3 with a probability of 0.30" in message
+    assert Received(of_doubtful_number(0.3), {}).n_believable == 1
+    weak = replace(of_doubtful_number(0.3), column_certainty=1.0)
+    assert Received(weak, {}).n_believable == 0

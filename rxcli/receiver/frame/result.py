@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.screen.outline import Outline
-from rxcli.types import FrameResult
+from rxcli.types import BELIEVABLE, FrameResult, PacketResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +25,11 @@ class Failure:
     tried: tuple[Any, ...] = ()
 
 
+def is_received(packet: PacketResult, result: FrameResult) -> bool:
+    """Whether a packet is believable, whatever its column's number: numbers are not the camera's."""
+    return packet.confidence >= BELIEVABLE * result.column_certainty
+
+
 class Received(NamedTuple):
     """Result of a frame, and its arrays at the stage boundaries; none where reception ended before."""
 
@@ -33,8 +38,8 @@ class Received(NamedTuple):
 
     @property
     def n_believable(self) -> int:
-        """Number of believable packets."""
-        return sum(packet.is_believable for packet in self.result.packets)
+        """Number of packets that are believable."""
+        return sum(is_received(packet, self.result) for packet in self.result.packets)
 
     def with_remark(self, remark: str | None) -> Received:
         """The same with a remark before the message, if there is one."""

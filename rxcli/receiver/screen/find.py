@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import find_combs, grid_of_comb
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
-from rxcli.receiver.screen.numbering import LightProfile, centred, first_columns, light_profile
+from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.strips import PictureStrips, read_strips, shows_narrow_columns
@@ -256,8 +256,6 @@ def _numbered(strips: PictureStrips, grid: Grid, layouts: Sequence[ColumnLayout]
         best, n = int(columns[odds.argmax()]), layout.n_columns
         own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, _LAST_STEPS, n_columns=n)
         axis, ends, has_bars = find_rows(strips, light, own, n, layout.aspect)
-        if not has_bars:
-            odds = odds + centred(profile.film, columns, n)
         for number, log_odds in zip(columns.tolist(), odds.tolist(), strict=True):
             if log_odds > odds.max() + _MIN_LOG_ODDS:
                 corners, counted = axis.corners(ends, number - best), own.shifted(number - best)

@@ -9,9 +9,6 @@ from rxcli.receiver.screen.grid import Grid
 from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import FloatArray, Lens
 
-#: Certainty from which the number of a column is likely.
-_LIKELY = 0.5
-
 
 @dataclass(frozen=True, slots=True)
 class Outline:
@@ -45,11 +42,6 @@ class Outline:
     def lens(self) -> Lens | None:
         """Estimated lens that bends the columns; used where the camera has no known lens."""
         return self.grid.estimated_lens if self.grid else None
-
-    @property
-    def is_counted_from_left(self) -> bool:
-        """Whether columns are counted from the left because no side of the screen is visible."""
-        return self.fills and self.column_offset is None and self.certainty < _LIKELY
 
     @property
     def result_fields(self) -> dict[str, Any]:

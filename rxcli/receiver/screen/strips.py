@@ -46,9 +46,8 @@ class PictureStrips:
     changes: Float32Array
     #: (B, S) float32: coherence of each strip's neighbours, 0..1, the share of its variance that is the columns'.
     coherence: Float32Array
-    #: (B, S) float32: mean light, as encoded pixel values.
+    #: (B, S) float32: mean light and that at the darkest instant, roughly linear, of white.
     level: Float32Array
-    #: (B, S) float32: light at the darkest instant, roughly linear, of white.
     darkest: Float32Array
     #: (B, S): middles of the strips, offsets from the picture's middle in picture widths: in the stored picture, and
     #: with the distortion of a known lens removed.
@@ -144,10 +143,11 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
 
     stored, flat = (flat_places(points, plane.width, plane.height, model) for model in (None, lens))
     by_window = means.reshape(x.size, n_windows, rows)
-    level, darkest = by_window.mean(axis=2).T, _roughly_linear(plane, by_window.min(axis=2).T)
-    of_strips = zip(_OF_STRIPS, (changes, lit, level, darkest, *stored, *flat), strict=True)
+    level = _roughly_linear(plane, by_window.mean(axis=2).T)
+    darkest = _roughly_linear(plane, by_window.min(axis=2).T)
+    of_strips: list[NDArray[Any]] = [changes, lit, level, darkest, *stored, *flat]
     return PictureStrips(
-        **{name: parted(values) for name, values in of_strips},
+        **{name: parted(values) for name, values in zip(_OF_STRIPS, of_strips, strict=True)},
         half_height=rows * short / 2 / plane.width,
         row_noise=noise,
         short_rows=short,

@@ -8,7 +8,7 @@ from dataclasses import replace
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.camera import FrameCamera
-from rxcli.receiver.frame.result import Failure, Received, failed
+from rxcli.receiver.frame.result import Failure, Received, failed, is_received
 from rxcli.receiver.plane import orientation
 from rxcli.receiver.search.cameras import known_camera
 from rxcli.receiver.search.outlines import ON_ITS_SIDE, lean_on_its_side, unreadable_orientation
@@ -74,7 +74,8 @@ def _receive_stated(cache: FrameCache, options: ReceiverOptions, receive: _Recei
 def _gives_few(result: FrameResult) -> bool:
     """Whether less than half of the lit columns gave a packet."""
     lit = [column for column in result.columns if column.status != "dark"]
-    return 2 * sum(column.status == "ok" for column in lit) < max(len(lit), 1)
+    n_received = sum(any(is_received(packet, result) for packet in column.packets) for column in lit)
+    return 2 * n_received < max(len(lit), 1)
 
 
 def _is_reversed(result: FrameResult) -> bool:

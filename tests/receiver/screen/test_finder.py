@@ -23,7 +23,13 @@ from rxcli.receiver.screen.find import (
     wide_grids,
 )
 from rxcli.receiver.screen.grid import columns_at, grid_between
-from rxcli.receiver.screen.numbering import LightProfile, centred, first_columns, light_profile
+from rxcli.receiver.screen.numbering import (
+    LightProfile,
+    first_column_features,
+    first_columns,
+    light_profile,
+    numbering_weights,
+)
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.screen.rows import lit_range
@@ -300,27 +306,33 @@ def profile_of(picture: str) -> LightProfile:
 def test_columns_with_light_are_told_from_those_without() -> None:
     light = profile_of("window")
     inside, outside = (light.place > 3) & (light.place < 14), (light.place < -0.2) | (light.place > 20.2)
-    assert light.log_odds[inside].min() > light.log_odds[outside].max()
+    assert light.light[inside].min() > light.light[outside].max()
 
 
-def test_a_film_has_sharp_ends_and_fading_light_has_none() -> None:
+def test_a_film_has_sharp_edges_and_fading_light_has_none() -> None:
     light = profile_of("film")
-    np.testing.assert_allclose(light.film, (2.6, 17.4), atol=0.3)
-    assert profile_of("fading").film is None
+    rises, falls = light.edges(light.level)
+    borders = light.place - 1 / 16
+    np.testing.assert_allclose([borders[edge[:-1] > 0.9].mean() for edge in (rises, falls)], (2.6, 17.4), atol=0.1)
+    assert max(edge.max() for edge in profile_of("fading").edges(profile_of("fading").level)) < 0.5
     columns, log_odds, _ = first_columns(light, 20)
-    assert columns[(log_odds + centred(light.film, columns, 20)).argmax()] == 0
+    assert columns[log_odds.argmax()] == 0
 
 
-@pytest.mark.parametrize("film", [(0.8, 19.2), (0.6, 18.4)])
-def test_narrow_bars_on_both_sides_show_the_first_column(film: tuple[float, float]) -> None:
-    place = (np.arange(-16, 22 * 8) + 0.5) / 8
-    light = np.where((place > 1.5) & (place < 18.5), 2.0, 0.0)
-    profile = LightProfile(place, np.ones(place.size, bool), light, 10.0, film, None)
-    columns, log_odds, _ = first_columns(profile, 20)
-    log_odds += centred(film, columns, 20)
-    in_doubt = (log_odds > log_odds.max() - 2).sum() > 1
-    assert columns[log_odds.argmax()] == 0 or in_doubt
-    assert in_doubt == (sum(film) != 20)
+def profile(start: float, end: float, *, film: tuple[float, float] | None = None, right: float = 22.0) -> LightProfile:
+    """Columns' light between two places, and a bright picture of a film between two others."""
+    place = (np.arange(-16, right * 8) + 0.5) / 8
+    coherent = ((place > start) & (place < end)).astype(np.float64)
+    level = coherent if film is None else ((place > film[0]) & (place < film[1])).astype(np.float64)
+    return LightProfile(place, np.ones(place.size, bool), coherent, level, np.zeros(place.size), 10.0)
+
+
+@pytest.mark.parametrize("film", [(2.75, 17.25), (2.5, 16.25)])
+def test_bars_of_equal_width_on_both_sides_show_the_first_column(film: tuple[float, float]) -> None:
+    columns, log_odds, _ = first_columns(profile(2.5, 17.5, film=film), 20)
+    certainty = 1 / np.exp(log_odds - log_odds.max()).sum()
+    is_plain = certainty > 0.8 and columns[log_odds.argmax()] == 0
+    assert is_plain == (sum(film) == 20)
 
 
 def test_steady_light_around_the_screen_shows_the_first_column() -> None:
@@ -334,13 +346,13 @@ def test_steady_light_around_the_screen_shows_the_first_column() -> None:
 
 
 def test_light_that_ends_just_before_the_edge_of_the_picture_ends_on_the_screen() -> None:
-    place = (np.arange(-8, 20 * 8 + 3) + 0.5) / 8
-    light = np.where((place > 7) & (place < 20), 1.3, -0.1)
-    columns, log_odds, fills = first_columns(
-        LightProfile(place, np.ones(place.size, bool), light, 10.0, None, None), 20
-    )
+    columns, log_odds, fills = first_columns(profile(7, 20, right=20.4), 20)
     assert columns[log_odds.argmax()] == 0
     assert not fills
+
+
+def test_the_shipped_weights_are_those_of_the_features() -> None:
+    assert len(numbering_weights()) == first_column_features(profile(2, 18), 20)[1].shape[1]
 
 
 def test_light_ends_where_bars_begin_and_takes_no_more_than_a_screen() -> None:
