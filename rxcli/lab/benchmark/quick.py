@@ -47,7 +47,9 @@ def run(how: Run, seed: int, folder: Path) -> list[tuple[str, list[Row]]]:
 
     speed = {name: point for name, point in scenarios()["speed"].points.items() if name in _MEDIA}
     errors = _by_label("scene", records("quick", scenarios()["quick"].count), _ERRORS)
-    problems = Group(records("stability", _SCENES, ways=("receiver",)), "receiver", "receiver").problems
+    problems = Group(
+        records("stability", _SCENES, ways=("receiver",), points={"": {"named": True}}), "receiver", "receiver"
+    ).problems
     timed = _by_label("medium", records("speed", _REPEATS, points=speed, ways=("two threads",)), _TIMES)
     checks = {f"{_SCENES} random scenes": "; ".join(dict.fromkeys(problems)) or "ok"}
     checks |= {name: f"{ms:.0f} ms" for name, ms in start_times(_REPEATS).items()}
