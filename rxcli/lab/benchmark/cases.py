@@ -136,7 +136,6 @@ WAYS: dict[str, Way] = {
     "no skip at all": _with_options(skip=frozenset()),
     "two threads": _on_two_threads,
     "grey levels": lambda case: case.receive(case.options, with_grey_levels),
-    "cropped by a row": lambda case: case.receive(cropped_options(case.options), without_first_row),
     "bound": lambda case: map(bound_result, case.trials),
     "paper": lambda case: map(paper_result, case.trials),
 }
@@ -275,31 +274,6 @@ def with_grey_levels(frame: Frame) -> Frame:
     pixels += rng.choice([-1, 0, 1], pixels.shape, p=[_GREY_SHARE / 2, 1 - _GREY_SHARE, _GREY_SHARE / 2])
     changed: Any = pixels.clip(0, np.iinfo(frame.pixels.dtype).max).astype(frame.pixels.dtype)
     return replace(frame, pixels=changed)
-
-
-def without_first_row(frame: Frame) -> Frame:
-    """The frame without its first row."""
-    mosaic = frame.mosaic
-    if mosaic is not None:
-        mosaic = replace(mosaic, pattern=np.roll(mosaic.pattern, -1, axis=0))
-    pixels: Any = np.ascontiguousarray(frame.pixels[1:])
-    return replace(frame, pixels=pixels, mosaic=mosaic)
-
-
-def cropped_options(options: ReceiverOptions) -> ReceiverOptions:
-    """Adapt corners and camera of a picture to the removal of its first row."""
-    cameras = tuple(map(_cropped_camera, options.cameras)) if options.force_camera else options.cameras
-    corners = None if options.corners is None else options.corners - np.array([0.0, 1.0])
-    return replace(options, cameras=cameras, corners=corners)
-
-
-def _cropped_camera(camera: CameraProfile) -> CameraProfile:
-    modes = tuple(msgspec.structs.replace(mode, height=mode.height - 1) for mode in camera.modes)
-    lens = camera.lens
-    if lens is not None:
-        x, (skew, fy, cy), last = lens.camera_matrix
-        lens = msgspec.structs.replace(lens, height=lens.height - 1, camera_matrix=(x, (skew, fy, cy - 1), last))
-    return msgspec.structs.replace(camera, modes=modes, lens=lens)
 
 
 def nonsense(result: FrameResult) -> Iterator[str]:
