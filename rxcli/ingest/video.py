@@ -138,10 +138,11 @@ def _pixel_bytes(stream: Any) -> float:
 def _frames(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
     metadata = clip_metadata(dict(container.metadata) | dict(stream.metadata))
     decode = _decode_mjpeg if stream.codec_context.name == "mjpeg" else _decode
-    for index, frame in enumerate(decode(path, container, stream, progress)):
+    for n_whole, frame in enumerate(decode(path, container, stream, progress)):
         progress.last_time_s = frame.time_s
         if progress.doubt and not metadata.not_believed:
             metadata = replace(metadata, not_believed=(progress.doubt,))
+        index = n_whole + progress.n_damaged
         yield replace(frame, index=index, metadata=replace(metadata, orientation=frame.metadata.orientation))
 
 

@@ -215,6 +215,7 @@ def test_a_packet_that_gives_no_frame_is_damage(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(data[:place] + struct.pack(">IB", size - 4, 0x1F) + data[place + 5 :])
     frames, error = read_all(tmp_path / "a.mp4")
     assert [frame.pixels.tobytes() for frame in frames] == whole[:8] + whole[12:]
+    assert [frame.index for frame in frames] == [*range(8), *range(12, N_FRAMES)]
     assert "4 frames are damaged, the first after 0.233 s" in str(error)
 
 
