@@ -259,6 +259,34 @@ class SlotSamples:
 
 
 @dataclass(frozen=True, slots=True)
+class BurstSamples:
+    """Samples of the copies of bursts side by side, ordered by the slot in which their exposure starts.
+
+    P slots of a packet, Q samples per slot; lanes: B bursts times C columns; F: copies of a burst times strips.
+    """
+
+    #: (P, Q, lanes, F) float32: light over its local mean; variance of its noise; 1 where valid, else 0; and light of
+    #: the adjacent columns per unit of picture.
+    light: Float32Array
+    noise: Float32Array
+    valid: Float32Array
+    neighbours: Float32Array
+    #: (F,) share of a column's own light in its strips.
+    own: Float32Array
+    exposure_slots: float
+    #: (lanes,) log density of the light relative to that of `light`, per sample of a slot.
+    log_scale: FloatArray
+    n_bursts: int
+    #: (lanes, 9) log prior of w = 1..9, or None.
+    w_log_prior: FloatArray | None = None
+
+    @property
+    def n_columns(self) -> int:
+        """Columns, C."""
+        return int(self.light.shape[2]) // self.n_bursts
+
+
+@dataclass(frozen=True, slots=True)
 class BurstPosteriors:
     """Posteriors of B bursts of C columns; N payload symbols of up to 7 bits."""
 

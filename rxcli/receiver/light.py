@@ -104,6 +104,20 @@ def sees_dark_header(places: FloatArray, exposure_slots: float, min_reach: float
     return np.asarray(np.abs(places - (_DARK_FROM + _DARK_TO) / 2) <= reach)
 
 
+@cache
+def exposed_from(exposure_slots: float, samples_per_slot: int) -> FloatArray:
+    """(Q, reach + 1) weight of slots n .. n + reach in samples whose exposure starts in slot n.
+
+    Args:
+        exposure_slots: length of the exposure, slots.
+        samples_per_slot: samples per slot, Q; a sample is a mean over its own length.
+    """
+    length = max(exposure_slots, _MIN_WIDTH)
+    start = (np.arange(samples_per_slot)[:, None] + (np.arange(_FINE) + 0.5) / _FINE) / samples_per_slot
+    slots = np.arange(np.ceil(length) + 1)
+    return np.asarray(exposure_shares(start[..., None] + length / 2, slots, length).mean(axis=1))
+
+
 @dataclass(frozen=True, slots=True)
 class Exposure:
     """Response of slots through the exposure, on a grid of Q samples per slot.

@@ -11,16 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import ReceiverError
+from rxcli.numerics import box_sums
 from rxcli.options import ReceiverOptions
+from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver import channel
-from rxcli.receiver.channel import denoise
-from rxcli.receiver.decode import detect
+from rxcli.receiver.channel import denoise, ratios
+from rxcli.receiver.decode import detect, survivors
+from rxcli.receiver.decode.settings import QUICK_SURVIVORS
+from rxcli.receiver.decode.settings import SURVIVORS as survivor_settings
 from rxcli.receiver.frame.acquisition import Acquisition, noise_of
-from rxcli.receiver.frame.passes import Reception, best_log_prob, dark_columns, packet_llr, word_log_prob
+from rxcli.receiver.frame.passes import Reception, dark_columns, packet_llr
 from rxcli.receiver.frame.settings import SETTINGS, STILL
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma, slot_llr
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import BurstPosteriors, Clock, Denoiser, Float32Array, FloatArray, SlotSamples
+from rxcli.receiver.sync.settings import SETTINGS as SYNC
+from rxcli.types import BurstPosteriors, BurstSamples, Clock, Denoiser, Float32Array, FloatArray, SlotSamples
+
+#: Least distance of a slot's probability from 0 and 1.
+_MIN_DOUBT = 1e-4
 
 
 def decode_photograph(acquisition: Acquisition, skip: frozenset[str], initial: Reception) -> Reception:
@@ -57,10 +65,8 @@ def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception) -
     candidates = doubtful_columns(initial) if "certain_columns" in skip else np.arange(n_columns)
     lit = candidates[~dark_columns(initial.snr)[candidates]] if "dark_columns" in skip else candidates
     skipped = {"certain_columns": n_columns - candidates.size, "dark_columns": candidates.size - lit.size}
-    for run_pass in (_of_all_strips, _without_row_noise):
-        columns = np.intersect1d(lit, doubtful_columns(reception)) if "certain_columns" in skip else lit
-        if columns.size:
-            reception = run_pass(acquisition, reception, columns)
+    if lit.size:
+        reception = follow_picture(acquisition, reception, lit)
     return replace(reception, skipped={name: count for name, count in skipped.items() if count})
 
 
@@ -68,6 +74,8 @@ def initial_pass(acquisition: Acquisition) -> Reception:
     """Make a pass over strips binned in pairs, from an initial estimate of the slots."""
     acquisition = replace(acquisition, profiles=acquisition.binned)
     clock = acquisition.clock
+    if clock.exposure_slots > SYNC.long_exposure_slots:
+        return _joint_initial_pass(acquisition)
     # Demosaicing and denoising mix neighbouring rows: with few rows per slot this widens the effective exposure.
     exposure_slots = float(np.hypot(clock.exposure_slots, 1 / clock.rows_per_slot))
     clock = replace(clock, exposure_slots=exposure_slots)
@@ -82,7 +90,102 @@ def initial_pass(acquisition: Acquisition) -> Reception:
     clock = _in_bursts(acquisition, clock, likelihoods.metrics)
     clock = sync.corrected(clock, likelihoods.timing)
     posteriors = _detect(likelihoods.metrics, clock)
-    return Reception(clock, samples, contrast, posteriors, likelihoods.snr, model, likelihoods.metrics)
+    joint = np.zeros(columns.size, bool)
+    return Reception(clock, samples, contrast, posteriors, likelihoods.snr, model, likelihoods.metrics, joint)
+
+
+def _joint_initial_pass(acquisition: Acquisition) -> Reception:
+    """Make a pass that detects slots and picture jointly: first every copy by itself, then the copies of bursts."""
+    clock = acquisition.clock
+    samples = sync.sample_slots(acquisition.profiles, clock, STILL.coarse_samples)
+    model = _light_model(acquisition, clock, samples)
+    valid = samples.light[samples.valid > 0]
+    black_level = STILL.dark_share * float(np.percentile(valid, STILL.dark_percent)) if valid.size else 0.0
+    model = replace(model, black_level=black_level)
+    columns = np.arange(len(samples.light))
+    by_start = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
+
+    def of_bursts(clock: Clock, lit: Float32Array | None) -> BurstSamples:
+        noise, crosstalk = model.noise, model.crosstalk
+        return ratios.burst_samples(by_start, clock, model.black_level, noise, crosstalk, columns, lit)
+
+    single = replace(clock, burst=np.arange(clock.n_copies))
+    alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
+    metrics = channel.metrics_of(_llr_of(single.on_grid(alone.lit)), 1)
+    lit = single.on_grid(alone.lit)
+    tried, most = [], STILL.max_column_gain
+    for way, _ in sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats):
+        bursts = of_bursts(way, lit)
+        tried.append((way, bursts, survivors.detect(bursts, QUICK_SURVIVORS)))
+    gains = [np.clip(found.log_evidence - tried[0][2].log_evidence, -most, most).sum() for *_, found in tried]
+    clock, bursts, posteriors = tried[int(np.argmax(gains))]
+    free = survivors.free_log_evidence(bursts, QUICK_SURVIVORS)
+    shape = posteriors.header_llr.shape
+    posteriors = replace(posteriors, header_llr=np.broadcast_to((posteriors.log_evidence - free) / shape[0], shape))
+    contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
+    snr = _joint_snr(model.over_black(samples), samples, model, clock)
+    joint = np.ones(len(columns), bool)
+    return Reception(clock, samples, contrast, posteriors, snr, model, metrics, joint, free)
+
+
+def _joint_snr(
+    light: Float32Array, samples: SlotSamples, model: channel.ObservationModel, clock: Clock
+) -> Float32Array:
+    """(C, N) squared contrast of a slot over its noise, of the light on average."""
+    q = samples.samples_per_slot
+    around = SLOTS_PER_SYMBOL * q
+    mean = box_sums(light, around) / np.maximum(box_sums(samples.valid, around), 1)
+    contrast = 2 * np.maximum(mean, 0) * model.crosstalk.own / np.float32(max(clock.exposure_slots, 1.0))
+    ratio = contrast**2 / model.noise.variance(np.asarray(mean, np.float32)) * samples.valid
+    return np.asarray(ratio[..., q // 2 :: q].sum(axis=1) * np.float32(survivor_settings.information))
+
+
+def _llr_of(lit: Float32Array) -> Float32Array:
+    """Log-likelihood ratios of slots from their probabilities."""
+    bounded = np.clip(lit, _MIN_DOUBT, 1 - _MIN_DOUBT)
+    return np.asarray(np.log(bounded) - np.log1p(-bounded), np.float32)
+
+
+def follow_picture(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
+    """Detect slots and picture of some columns jointly, with all strips, given the slots decided so far."""
+    clock, q = reception.clock, STILL.coarse_samples
+    is_long = reception.free_log_evidence is not None
+    samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), q, ratios.by_start(clock))
+    lit = clock.on_grid(reception.posteriors.lit)
+    if is_long:
+        model = replace(model, black_level=_likeliest_black_level(samples, clock, model, columns, lit))
+    bursts = ratios.burst_samples(samples, clock, model.black_level, model.noise, model.crosstalk, columns, lit)
+    if not is_long:
+        prior = np.maximum(reception.posteriors.w_log_prob[columns], STILL.min_weight_log_prior) / bursts.n_bursts
+        bursts = replace(bursts, w_log_prior=np.tile(prior, (bursts.n_bursts, 1)))
+    found = survivors.detect(bursts)
+    found = replace(
+        found,
+        header_llr=reception.posteriors.header_llr[:, columns],
+        log_evidence=reception.posteriors.log_evidence[columns],
+    )
+    joint = reception.joint.copy()
+    joint[columns] = True
+    return replace(reception, posteriors=reception.posteriors.with_columns(columns, found), joint=joint)
+
+
+def _likeliest_black_level(
+    samples: SlotSamples,
+    clock: Clock,
+    model: channel.ObservationModel,
+    columns: NDArray[np.int64],
+    lit: Float32Array,
+) -> float:
+    """Black level with the largest evidence of packets in some of `columns`."""
+    some = columns[np.linspace(0, columns.size - 1, STILL.n_judged_columns).round().astype(int)]
+    levels = np.percentile(samples.light[samples.valid > 0], STILL.dark_percent) * np.array(STILL.dark_shares)
+    noise, crosstalk = model.noise, model.crosstalk
+
+    def evidence(black_level: float) -> float:
+        bursts = ratios.burst_samples(samples, clock, black_level, noise, crosstalk, some, lit)
+        return survivors.log_evidence(bursts, QUICK_SURVIVORS)
+
+    return float(max(levels.tolist(), key=evidence))
 
 
 def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[tuple[Reception, float]]:
@@ -90,6 +193,8 @@ def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[
 
     Each comes with the log-likelihood by which its copies are less similar.
     """
+    if reception.free_log_evidence is not None:
+        return
     (_, similarity), *rivals = sync.possible_bursts(reception.clock, slot_llr(reception.metrics), acquisition.repeats)
     for clock, rival_similarity in rivals:
         if similarity - rival_similarity <= SETTINGS.plain_bursts or not reception.is_complete.any():
@@ -110,25 +215,16 @@ def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
     return np.flatnonzero(doubtful.any(axis=0))
 
 
-def _of_all_strips(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
-    """Receive some columns with all strips and all scales of the picture."""
-    return _received(reception, columns, *_view(acquisition, reception, columns, STILL.coarse_samples))
-
-
-def _without_row_noise(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
-    """Receive some columns on the fine grid after removal of row noise."""
+def without_row_noise(
+    acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]
+) -> tuple[Reception, denoise.DenoiserInput]:
+    """Metrics of some columns on the fine grid after removal of row noise; and the input of the auto-encoder."""
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), denoise.SAMPLES_PER_SLOT)
-    samples = denoise.remove_row_noise(reception.scene_of(samples, model)).samples
-    return _received(replace(reception, cleaned=(samples, model)), columns, samples.of_columns(columns), model)
-
-
-def _received(
-    reception: Reception, columns: NDArray[np.int64], samples: SlotSamples, model: channel.ObservationModel
-) -> Reception:
-    """Receive some columns from their samples, given the slots decided so far."""
     lit = reception.clock.on_grid(reception.posteriors.lit)
-    likelihoods = channel.slot_likelihoods(samples, reception.clock, model, lit, columns)
-    return _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr)
+    samples = denoise.remove_row_noise(reception.scene_of(samples, model)).samples
+    likelihoods = channel.slot_likelihoods(samples.of_columns(columns), reception.clock, model, lit, columns)
+    by_slot = _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr)
+    return by_slot, by_slot.scene_of(samples, model)
 
 
 def _with_metrics(
@@ -138,15 +234,21 @@ def _with_metrics(
     of_all, snr_of_all = reception.metrics.copy(), reception.snr.copy()
     of_all[columns], snr_of_all[columns] = metrics, snr
     posteriors = reception.posteriors.with_columns(columns, _detect(metrics, reception.clock))
-    return replace(reception, metrics=of_all, snr=snr_of_all, posteriors=posteriors)
+    joint = reception.joint.copy()
+    joint[columns] = False
+    return replace(reception, metrics=of_all, snr=snr_of_all, posteriors=posteriors, joint=joint)
 
 
 def _view(
-    acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64], samples_per_slot: int
+    acquisition: Acquisition,
+    reception: Reception,
+    columns: NDArray[np.int64],
+    samples_per_slot: int,
+    own_clock: Clock | None = None,
 ) -> tuple[SlotSamples, channel.ObservationModel]:
     """Sample all strips of some columns and adapt the light model of the initial pass to them."""
     clock, binned = reception.clock, reception.samples
-    samples = sync.sample_slots(acquisition.profiles, clock, samples_per_slot, columns)
+    samples = sync.sample_slots(acquisition.profiles, own_clock or clock, samples_per_slot, columns)
     n_strips = samples.light.shape[1]
     # Ratio of the pixels per sample in the initial pass to those here.
     larger = n_strips / binned.light.shape[1]
@@ -168,41 +270,39 @@ def apply_autoencoder(
     Returns:
         The reception, the columns whose corrections were kept, and the report; None if nothing was done.
     """
-    if options.cae == "never":
-        return reception, frozenset(), None
-    if options.cae == "always":
-        columns = np.arange(reception.snr.shape[0])
-        reception = _without_row_noise(acquisition, reception, columns)
-    else:
-        columns = _worth_showing(reception, doubtful_columns(reception))
-    scene = reception.scene
-    if columns.size == 0 or scene is None:
+    n_columns = len(reception.snr)
+    columns = np.arange(n_columns) if options.cae == "always" else doubtful_columns(reception)
+    columns = _worth_showing(acquisition, reception, columns)
+    if options.cae == "never" or columns.size == 0 or reception.free_log_evidence is not None:
         return reception, frozenset(), None
     report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
+    by_slot, scene = without_row_noise(acquisition, reception, columns)
     try:
         denoiser = options.denoiser or _denoiser()
         corrections = denoiser.slot_corrections(scene, columns)
     except ReceiverError as error:
         return reception, frozenset(), {**report, "columns": 0, "message": str(error)}
-    corrected = reception.metrics[columns] + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
-    after = _with_metrics(reception, columns, corrected, reception.snr[columns])
-    improved = columns[(word_log_prob(after) > word_log_prob(reception))[columns]]
+    corrected = by_slot.metrics[columns] + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
+    after = _with_metrics(by_slot, columns, corrected, by_slot.snr[columns])
+    improved = columns[
+        after.best_confidence(frozenset(columns.tolist()))[columns] > reception.best_confidence()[columns]
+    ]
     report.update(model=denoiser.name, kept=improved.size)
-    metrics = reception.metrics.copy()
-    metrics[improved] = after.metrics[improved]
+    is_improved = np.zeros(n_columns, bool)
+    is_improved[improved] = True
     posteriors = reception.posteriors.with_columns(improved, after.posteriors.of_columns(improved))
     # The network knows the positions of headers, so their presence is judged without it.
     posteriors = replace(posteriors, header_llr=reception.posteriors.header_llr)
-    return replace(reception, metrics=metrics, posteriors=posteriors), frozenset(improved.tolist()), report
+    metrics = np.where(is_improved[:, None, None], after.metrics, reception.metrics)
+    joint = reception.joint & ~is_improved
+    return replace(reception, metrics=metrics, posteriors=posteriors, joint=joint), frozenset(improved.tolist()), report
 
 
-def _worth_showing(reception: Reception, columns: NDArray[np.int64]) -> NDArray[np.int64]:
+def _worth_showing(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> NDArray[np.int64]:
     """The surest of `columns`, as many as the time of the network allows."""
-    if reception.cleaned is None:
-        return columns[:0]
-    n_strips = reception.cleaned[0].light.shape[1]
+    n_strips = acquisition.profiles.light.shape[1]
     n_columns = max(STILL.max_network_slots // (n_strips * reception.clock.n_slots), 1)
-    return np.sort(columns[np.argsort(-best_log_prob(reception)[columns], kind="stable")[:n_columns]])
+    return np.sort(columns[np.argsort(-reception.best_confidence()[columns], kind="stable")[:n_columns]])
 
 
 @lru_cache(maxsize=1)

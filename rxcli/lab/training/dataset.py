@@ -24,7 +24,7 @@ from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput, network_inputs, payload_observed
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.search import Found, search
-from rxcli.receiver.still import decode, doubtful_columns
+from rxcli.receiver.still import decode, doubtful_columns, without_row_noise
 from rxcli.types import Clock, FloatArray
 
 #: Words of the largest codebook, and what stands for a word that is not known.
@@ -117,9 +117,10 @@ def _simulated(simulated: SimulatedScene, seed: int) -> Sample | None:
     if not isinstance(found, Found):
         return None
     reception = decode(found.best.acquisition, trial.options().skip, found.best.reception)
-    scene, columns = reception.scene, doubtful_columns(reception)
-    if scene is None or not columns.size:
+    columns = doubtful_columns(reception)
+    if reception.free_log_evidence is not None or not columns.size:
         return None
+    _, scene = without_row_noise(found.best.acquisition, reception, columns)
     slots = sent_slots(trial.capture.exposure, scene.clock)
     if not _headers_fit(slots, scene.clock):
         return None

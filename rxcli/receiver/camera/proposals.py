@@ -71,6 +71,8 @@ def propose(
     level *= weight
     bends = [np.zeros(4)] + ([likeliest_bend(coarse, level)] if may_bend else [])
     found = [clock for bend in bends for clock in _clocks(coarse, level, bend, width, exposures)]
+    if max(exposures.values()) > SETTINGS.long_exposure_slots or not exposure_s:
+        found += _smeared_clocks(strips, exposures, may_bend=may_bend)
     distinct: list[CameraHypothesis] = []
     for hypothesis in sorted(found, key=lambda clock: -clock.score):
         if len(distinct) < SETTINGS.n_proposed and not any(_is_same(hypothesis, better) for better in distinct):
@@ -162,6 +164,91 @@ def _clocks(
                     curvature_sd=np.abs(bend) / 4,
                     stated_exposure_slots=exposure,
                 )
+
+
+def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_bend: bool) -> Iterator[CameraHypothesis]:
+    """Clocks of light that is exposed for several slots: its changes over one slot are as sharp as a short exposure."""
+    for rows, strength in slot_lines(strips):
+        change = changes_over(strips, rows)
+        bends = [np.zeros(4)] + ([likeliest_bend(strips, change)] if may_bend else [])
+        for bend in bends:
+            columns = columns_of(straightened(strips, change, bend), strips.n_columns)
+            copies = _surprise(_autocorrelation(columns), round(2 * SLOTS_PER_SYMBOL * rows))
+            total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
+            for length, exposure in exposures.items():
+                if rows * (length - PREAMBLE_SLOTS) > columns.shape[1]:
+                    continue
+                common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
+                common += 2 * min(strength, SETTINGS.max_line)
+                for is_reversed, header in enumerate(_header_peaks(total, rows, length)):
+                    yield CameraHypothesis(
+                        rows_per_slot=rows * strips.pitch,
+                        packet_slots=length,
+                        reversed=bool(is_reversed),
+                        curvature=bend,
+                        exposure_slots=exposure or SETTINGS.usual_long_exposure_slots,
+                        score=max(header, 0.0) ** 2 + common,
+                        rows_per_slot_sd=rows * rows * strips.pitch / (4 * columns.shape[1]),
+                        curvature_sd=np.abs(bend) / 4,
+                        stated_exposure_slots=exposure,
+                    )
+
+
+def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
+    """Rows a slot and how far its line stands out, by the bends of the light, likeliest first.
+
+    Whatever the exposure, light bends between slots only.
+    """
+    black = SETTINGS.dark_share * float(np.percentile(strips.light, SETTINGS.dark_percent))
+    light = np.log(np.maximum(strips.light - np.float32(black), np.float32(SETTINGS.min_light)))
+    found: list[tuple[float, float]] = []
+    for lag in SETTINGS.bend_lags:
+        if light.shape[1] < 8 * SLOTS_PER_SYMBOL * lag:
+            continue
+        smooth = _blurred(light, max(lag // 2, 1))
+        bend = np.abs(smooth[:, 2 * lag :] - 2 * smooth[:, lag:-lag] + smooth[:, : -2 * lag])
+        bend = np.minimum(bend / (np.median(bend, axis=1, keepdims=True) + np.float32(TINY)), SETTINGS.max_bend_ratio)
+        columns = bend.reshape(strips.n_columns, -1, bend.shape[1]).mean(axis=1)
+        columns -= _blurred(columns, 20 * SLOTS_PER_SYMBOL * lag // 2)
+        n = columns.shape[1]
+        power = np.square(np.abs(np.fft.rfft(columns * np.hanning(n), _FINE * n, axis=1)))
+        spectrum = (power / (power.mean(axis=1, keepdims=True) + TINY)).sum(axis=0)
+        spectrum /= _blurred(spectrum[None].astype(np.float32), SETTINGS.line_bins)[0] + np.float32(TINY)
+        frequency = np.arange(spectrum.size) / (_FINE * n)
+        mosaic = np.abs(frequency - 0.25) < SETTINGS.mosaic_line
+        inside = (frequency > 1 / (7 * lag)) & (frequency < 1 / (1.6 * lag)) & ~mosaic
+        peaks = _peaks(np.where(inside, spectrum, 0.0), SETTINGS.n_peaks, 2 * _FINE)
+        found += [(float(spectrum[round(peak)]), _FINE * n / peak) for peak in peaks.tolist() if peak > 0]
+    distinct: list[tuple[float, float]] = []
+    for strength, rows in sorted(found, reverse=True):
+        if len(distinct) < SETTINGS.n_peaks and all(abs(np.log(rows / r)) > SETTINGS.same_clock for r, _ in distinct):
+            distinct.append((rows, strength))
+    return distinct
+
+
+def changes_over(strips: ColumnStrips, rows: float) -> Float32Array:
+    """(M, R) change of the light over some rows against its local level, bounded; 0 where not on the screen."""
+    smooth = _blurred(strips.light, max(round(rows / 2), 1))
+    size = round(SETTINGS.level_slots * rows)
+    level = _blurred(strips.light, size) / np.maximum(_blurred(strips.inside, size), np.float32(TINY))
+    n, before = strips.light.shape[1], int(rows)
+    share, change = np.float32(rows - before), np.zeros_like(smooth)
+    earlier = (1 - share) * smooth[:, 1 : n - before] + share * smooth[:, : n - before - 1]
+    change[:, before + 1 :] = smooth[:, before + 1 :] - earlier
+    valid = strips.inside.copy()
+    valid[:, before + 1 :] *= strips.inside[:, : n - before - 1]
+    valid[:, : before + 1] = 0
+    change *= valid / (level + np.float32(strips.noise.sigma) + np.float32(TINY))
+    change /= np.sqrt(
+        np.square(change).sum(axis=1, keepdims=True) / np.maximum(valid.sum(axis=1, keepdims=True), 1)
+    ) + np.float32(TINY)
+    return np.clip(change, -SETTINGS.max_change, SETTINGS.max_change)
+
+
+def _blurred(values: Float32Array, n: int) -> Float32Array:
+    import cv2
+
+    return np.asarray(cv2.blur(np.ascontiguousarray(values), (min(n, 2 * values.shape[1] - 1) | 1, 1)))
 
 
 def _autocorrelation(columns: Float32Array) -> FloatArray:

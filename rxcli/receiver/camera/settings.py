@@ -44,6 +44,22 @@ class EstimateSettings:
     same_clock: float = 4e-3
     n_proposed: int = 5
 
+    #: Exposure from which changes of the light are looked at, and the default one, slots.
+    long_exposure_slots: float = 2.3
+    usual_long_exposure_slots: float = 4.0
+    #: Rows over which bends of the light are taken; limits of a bend, in medians, and of a change, in rms; slots of
+    #: the local level.
+    bend_lags: tuple[int, ...] = (1, 2, 4, 8)
+    max_bend_ratio: float = 4.0
+    max_change: float = 1.5
+    level_slots: float = 8.0
+    #: Black level, as a share of a percentile of the light; least light above it.
+    dark_share: float = 0.8
+    dark_percent: float = 0.5
+    min_light: float = 1e-4
+    #: Bins around a line that it is compared with; distance of the mosaic's line, cycles a row.
+    line_bins: int = 801
+    mosaic_line: float = 2e-3
     #: Slots over which the picture is taken as constant.
     picture_slots: float = 25.0
     #: Fits at most, and slots by which a fit moves the clock, anywhere, from which on a frame with plain packets is

@@ -18,6 +18,10 @@ class ChannelSettings:
     picture_scales: tuple[int, ...] = (1, 2, 8)
     #: Minimum relative variance of a prediction, which covers the uncertainty of the crosstalk.
     min_texture: float = 0.002
+    #: Joint detection of slots and picture: least local light, standard deviations of a dark sample; relative error of
+    #: the light beyond its noise.
+    min_level_sigmas: float = 0.3
+    relative_error: float = 0.02
 
 
 SETTINGS = ChannelSettings()

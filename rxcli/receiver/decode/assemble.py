@@ -68,7 +68,7 @@ def column_results(
         frame: the columns.
         posteriors: of B bursts and C columns.
         n_observed: (B, C, packet) see `slots_observed`.
-        confidence_features: (B, C, 8) of the packets.
+        confidence_features: (B, C, 11) of the packets.
         denoised: columns that were corrected by the auto-encoder.
     """
     quality = still_quality(posteriors, confidence_features)

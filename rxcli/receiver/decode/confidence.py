@@ -29,6 +29,7 @@ class _Photographs(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: tuple[float, ...]
     max_log_odds: float
     max_average: float
+    max_joint_log_odds: float
 
 
 class _Clips(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -83,7 +84,7 @@ class Quality:
     #: (B, C) probability that they are error-free, and expected share of wrong bits.
     confidence: FloatArray
     ber_hat: FloatArray
-    #: (B, C, 8) see `confidence_features`; (B, C, 3) of tracked bursts, see `clip_features`.
+    #: (B, C, 11) see `confidence_features`; (B, C, 3) of tracked bursts, see `clip_features`.
     confidence_features: FloatArray
 
     def reported(self, min_confidence: float) -> BoolArray:
@@ -143,14 +144,19 @@ def clip_features(burst: BurstInClip) -> FloatArray:
 
 
 def confidence_features(
-    posteriors: BurstPosteriors, slot_margin: Float32Array, denoised: BoolArray, n_strips: int
+    posteriors: BurstPosteriors,
+    slot_margin: Float32Array,
+    denoised: BoolArray,
+    n_strips: int,
+    joint: BoolArray | None = None,
 ) -> FloatArray:
-    """(B, C, 8) features of the confidence of packets, in the order of the weights.
+    """(B, C, 11) features of the confidence of packets, in the order of the weights.
 
     The light model scales its likelihoods down, because errors of strips and samples are correlated. They are still too
     sure where the picture or the camera deviates from the model; single slots then contradict the packet. The weights
     are a logistic regression on packets of the benchmark's `confidence` and `phones`. A change to the likelihoods of
-    the light model or to the auto-encoder requires a new fit.
+    the light model or to the auto-encoder requires a new fit. The last three are of columns whose slots and
+    picture were detected jointly, and 0 of the others; the first eight the other way round.
 
     Args:
         posteriors: of B bursts and C columns.
@@ -158,24 +164,33 @@ def confidence_features(
             where nothing is visible; see `slot_margin_by_burst`.
         denoised: (C,) whether corrections of the auto-encoder were kept.
         n_strips: strips of a column in the initial pass.
+        joint: (C,) whether slots and picture were detected jointly; None: of no column.
     """
     model = confidence_model().photographs
-    log_odds = np.minimum(_log_odds(posteriors.log_prob.sum(axis=2)), model.max_log_odds)
+    uncapped = _log_odds(posteriors.log_prob.sum(axis=2))
+    log_odds = np.minimum(uncapped, model.max_log_odds)
     against = np.log(_MIN_CONTRADICTION - np.minimum(slot_margin, 0).sum(axis=2))
     n_observed_slots = np.maximum((slot_margin != 0).sum(axis=2), 1)
     average = np.log(np.clip(slot_margin.sum(axis=2) / n_observed_slots, 1, model.max_average))
     strips = np.log(n_strips)
     terms = (1.0, log_odds, denoised, against, average, average * log_odds, strips, strips * log_odds)
-    return np.stack([np.broadcast_to(term, log_odds.shape) for term in terms], axis=2).astype(np.float64)
+    joint_terms = (1.0, np.minimum(uncapped, model.max_joint_log_odds), against)
+    is_joint = np.zeros(len(denoised), bool) if joint is None else joint
+    out = np.zeros((*log_odds.shape, len(terms) + len(joint_terms)))
+    for number, term in enumerate(terms):
+        out[..., number] = np.where(is_joint, 0.0, term)
+    for number, term in enumerate(joint_terms, len(terms)):
+        out[..., number] = np.where(is_joint, term, 0.0)
+    return out
 
 
 def confidence(confidence_features: FloatArray) -> FloatArray:
-    """(...) probability that packets are error-free, from their features (..., 8)."""
+    """(...) probability that packets are error-free, from their features (..., 11)."""
     return _probability(confidence_log_odds(confidence_features))
 
 
 def confidence_log_odds(confidence_features: FloatArray) -> FloatArray:
-    """(...) log-odds that packets are error-free, from their features (..., 8).
+    """(...) log-odds that packets are error-free, from their features (..., 11).
 
     Small noisy columns deserve more confidence than their posterior, because errors of their strips are less correlated
     than assumed. Where slots have the largest counted margin, noise does not explain a doubtful symbol, and the
@@ -184,6 +199,7 @@ def confidence_log_odds(confidence_features: FloatArray) -> FloatArray:
     model = confidence_model().photographs
     log_odds = np.asarray(confidence_features @ np.array(model.weights))
     posterior, average = confidence_features[..., 1], confidence_features[..., 4]
+    # Columns that were detected jointly have no average, and are never plain.
     plain = (average > np.log(model.max_average) - _FEATURE_TOLERANCE) & (posterior < model.max_log_odds)
     # The limit applies only to packets that are more likely right than wrong.
     return np.asarray(np.where(plain, np.minimum(log_odds, np.maximum(posterior, 0.0)), log_odds))

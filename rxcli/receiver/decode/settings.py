@@ -45,4 +45,26 @@ class DecodeSettings:
     min_similarity: float = 0.6
 
 
-SETTINGS = DecodeSettings()
+@dataclass(frozen=True, slots=True)
+class SurvivorSettings:
+    """Joint detection of slots and picture."""
+
+    #: Most paths that are kept, and log-likelihood below the best path at which one is dropped.
+    max_paths: int = 24
+    max_lag: float = 25.0
+    #: Effective number of independent samples per slot and strip.
+    information: float = 0.5
+    #: Change of the picture per slot, its deviation at the start, both relative; degrees of freedom of its errors.
+    drift_per_slot: float = 0.06
+    first_deviation: float = 0.3
+    degrees: float = 1.5
+    #: Limits: increase of the picture's variance at an outlier, its variance relative to the picture, and in units of
+    #: the local light; the picture in units of the local light.
+    max_jump: float = 1e4
+    max_variance: float = 4.0
+    min_variance: float = 1e-8
+    min_picture: float = 1e-3
+    max_picture: float = 1e3
+
+
+SETTINGS, SURVIVORS, QUICK_SURVIVORS = DecodeSettings(), SurvivorSettings(), SurvivorSettings(max_paths=12)

@@ -67,7 +67,7 @@ def still_soft_bits(
     Args:
         posteriors: of B bursts and C columns.
         n_observed: (B, C, packet).
-        confidence_features: (B, C, 8) of what was observed.
+        confidence_features: (B, C, 11) of what was observed.
         snr_db: of every column, None where nothing is visible.
         headerless: (C,) columns that show no packets.
     """

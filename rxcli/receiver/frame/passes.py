@@ -45,14 +45,18 @@ class Reception:
     model: channel.ObservationModel
     #: (C, N + memory, patterns).
     metrics: FloatArray
-    #: All strips on the fine grid without row noise, and their model; None if no column was doubtful.
-    cleaned: tuple[SlotSamples, channel.ObservationModel] | None = None
+    #: (C,) columns whose slots and picture were detected jointly, see `decode.survivors`.
+    joint: BoolArray
+    #: (C,) log evidence of arbitrary slots where all columns were detected so from the start; None: by the metrics.
+    free_log_evidence: FloatArray | None = None
     #: Skipped steps: name -> number of columns.
     skipped: dict[str, int] = field(default_factory=dict)
 
     @cached_property
     def column_llr(self) -> FloatArray:
         """(C,) log-likelihood ratio of each column containing packets against arbitrary slots."""
+        if self.free_log_evidence is not None:
+            return self.posteriors.log_evidence - self.free_log_evidence
         packets = self.posteriors.log_evidence - np.log(len(WEIGHTS))
         share = self.posteriors.w / SLOTS_PER_SYMBOL
         return np.asarray(packets - detect.free_log_evidence(self.metrics, share))
@@ -79,21 +83,21 @@ class Reception:
         return confidence.confidence(self.confidence_features(self.posteriors))
 
     def confidence_features(self, posteriors: BurstPosteriors, denoised: frozenset[int] = frozenset()) -> FloatArray:
-        """(B, C, 8) features of the confidence of packets with these posteriors; some columns were denoised."""
+        """(B, C, 11) features of the confidence of packets with these posteriors; some columns were denoised."""
         n_columns, n_strips = self.samples.light.shape[:2]
         was_denoised = np.isin(np.arange(n_columns), list(denoised))
-        return confidence.confidence_features(posteriors, self._slot_margin, was_denoised, n_strips)
+        return confidence.confidence_features(posteriors, self._slot_margin, was_denoised, n_strips, self.joint)
+
+    def best_confidence(self, denoised: frozenset[int] = frozenset()) -> FloatArray:
+        """(C,) confidence of each column's surest complete packet, 0 if there is none."""
+        own = confidence.confidence(self.confidence_features(self.posteriors, denoised))
+        return np.asarray(np.where(self.is_complete, own, 0.0).max(axis=0))
 
     @cached_property
     def _slot_margin(self) -> Float32Array:
         """(B, C, N) log-likelihood ratio of each burst's payload slots as decided against their opposite."""
         decided = self.clock.on_grid(self.posteriors.lit) > 0.5
         return assemble.slot_margin_by_burst(detect.slot_margin(self.metrics, decided), self.clock)
-
-    @property
-    def scene(self) -> denoise.DenoiserInput | None:
-        """Input of the auto-encoder; None if no column was doubtful."""
-        return None if self.cleaned is None else self.scene_of(*self.cleaned)
 
     def of_columns(self, columns: IntArray) -> Reception:
         """The reception of some columns."""
@@ -105,7 +109,8 @@ class Reception:
             posteriors=self.posteriors.of_columns(columns),
             snr=self.snr[columns],
             metrics=self.metrics[columns],
-            cleaned=None,
+            joint=self.joint[columns],
+            free_log_evidence=None if self.free_log_evidence is None else self.free_log_evidence[columns],
         )
 
     def scene_of(self, samples: SlotSamples, model: channel.ObservationModel) -> denoise.DenoiserInput:
@@ -121,11 +126,6 @@ def packet_llr(reception: Reception) -> float:
     """
     # The likelihoods are too sure, so a dark column or one that fits poorly must not count against packets.
     return float(np.logaddexp(reception.column_llr, 0.0).sum())
-
-
-def word_log_prob(reception: Reception) -> FloatArray:
-    """(C,) log probability that all decided words of a column are right, by the light model."""
-    return np.asarray(reception.posteriors.log_prob.sum(axis=(0, 2)))
 
 
 def headerless(reception: Reception) -> NDArray[np.bool_]:
@@ -150,11 +150,6 @@ def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:
     """(C,) whether a column has too little light for the light model."""
     n_observed, n_lit = (snr > 0).sum(axis=1), (snr > 1).sum(axis=1)
     return np.asarray((2 * n_lit < n_observed) | (n_observed == 0))
-
-
-def best_log_prob(reception: Reception) -> FloatArray:
-    """(C,) mean log probability of the symbols of each column's surest complete packet."""
-    return np.asarray(np.where(reception.is_complete, reception.posteriors.log_prob.mean(axis=2), -np.inf).max(axis=0))
 
 
 def soft_bits(

@@ -28,6 +28,16 @@ class StillSettings:
 
     #: Samples per slot of the first passes.
     coarse_samples: int = 2
+    #: Black level of a long exposure, as a share of a percentile of the light.
+    dark_share: float = 0.95
+    dark_percent: float = 0.5
+    #: Shares that are compared by evidence, on some columns.
+    dark_shares: tuple[float, ...] = (0.0, 0.4, 0.7, 0.85, 1.0, 1.1)
+    n_judged_columns: int = 5
+    #: Limit of the log evidence of a column for an assignment of copies to bursts.
+    max_column_gain: float = 40.0
+    #: Least log probability of a weight by the initial pass that the joint detection starts from.
+    min_weight_log_prior: float = -3.0
     #: Confidence of a packet below which its column gets further passes.
     doubtful: float = 0.985
     #: Limit of strip slots for the network, which takes most of the time; the least certain columns are left out.

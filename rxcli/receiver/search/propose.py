@@ -19,6 +19,7 @@ from rxcli.receiver.search.cameras import known_camera, propose_cameras, relabel
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
+from rxcli.receiver.sync.settings import SETTINGS as SYNC
 from rxcli.types import Clock, RowProfiles
 
 #: Number of columns on which a clock is sought first, or the nearest available number.
@@ -113,7 +114,9 @@ class Proposer:
         profiles = self.context(hypothesis).sample_columns(hypothesis.screen.columns)
         with self.cache.timer("clock"):
             clock = _clock(hypothesis, profiles)
-        if clock is None or clock.header_peak_ratio < SETTINGS.min_lead:
+        # Through a long exposure headers stand out less, and evidence decides.
+        is_long = clock is not None and clock.exposure_slots > SYNC.long_exposure_slots
+        if clock is None or clock.header_peak_ratio < (1.0 if is_long else SETTINGS.min_lead):
             return None
         lead = np.log(clock.header_peak_ratio / SETTINGS.clear_lead)
         log_prior = hypothesis.log_prior + SETTINGS.lead_weight * min(float(lead), 0.0)

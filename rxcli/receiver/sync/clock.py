@@ -154,6 +154,38 @@ def search_contrast(light: Float32Array, valid: Float32Array, min_sigma: float) 
     return pooled, weight
 
 
+def slot_differences(light: Float32Array, valid: Float32Array, min_sigma: float) -> tuple[Float32Array, Float32Array]:
+    """As `search_contrast`, for long exposures: changes of light over one slot, which are as sharp as a short exposure.
+
+    An exposure of L slots that ends one slot later has gained one slot and lost the one L slots before.
+    """
+    import cv2
+
+    q = SETTINGS.search_samples
+    flat = light.reshape(-1, light.shape[-1])
+    size = (SETTINGS.difference_slots * q | 1, 1)
+    level = cv2.blur(flat, size) / np.maximum(cv2.blur(valid.reshape(flat.shape), size), np.float32(1 / size[0]))
+    smooth = cv2.blur(flat, (q // 2 | 1, 1))
+    change = np.zeros_like(smooth)
+    change[:, q:] = smooth[:, q:] - smooth[:, :-q]
+    change /= np.maximum(level, 0) + np.float32(min_sigma)
+    change = change.reshape(light.shape)
+    is_valid = valid.copy()
+    is_valid[..., q:] *= valid[..., :-q]
+    is_valid[..., :q] = 0
+    count = np.maximum(is_valid.sum(axis=-1, keepdims=True), 1)
+    change /= np.sqrt((change * change * is_valid).sum(axis=-1, keepdims=True) / count) + np.float32(TINY)
+    bound = np.float32(SETTINGS.max_difference)
+    return (np.clip(change, -bound, bound) * is_valid).mean(axis=1) / bound, is_valid.sum(axis=1)
+
+
+def _without_echo(response: FloatArray, samples: float) -> FloatArray:
+    """The response of differences (C, n) less the one an exposure later, where each header shows again, inverted."""
+    n = response.shape[1]
+    index = np.arange(n)
+    return np.stack([row - np.interp(index + samples, index, row, right=0.0) for row in response])
+
+
 def header_response(pooled: Float32Array, weight: Float32Array, samples_per_slot: int) -> FloatArray:
     """(C, n) float64 correlation of every column with a header that starts at each sample.
 
@@ -182,11 +214,15 @@ def find_clock(
     top, bottom = row_span(profiles)
     step = rows_per_slot / SETTINGS.search_samples
     n = int((bottom - top) / step)
-    if n < SLOTS_PER_SYMBOL * SETTINGS.search_samples:
+    if n < SLOTS_PER_SYMBOL * SETTINGS.search_samples or exposure_slots >= SETTINGS.max_exposure_slots:
         return None
     light, valid = resample(profiles, top, step, n)
-    pooled, weight = search_contrast(light, valid, sigma / np.sqrt(max(step, 1.0)))
+    is_long = exposure_slots > SETTINGS.long_exposure_slots
+    row_sigma = sigma / np.sqrt(max(step, 1.0))
+    pooled, weight = (slot_differences if is_long else search_contrast)(light, valid, row_sigma)
     response = header_response(pooled, weight, SETTINGS.search_samples)
+    if is_long:
+        response = _without_echo(response, exposure_slots * SETTINGS.search_samples)
     period = packet_slots * SETTINGS.search_samples
     power = folded(np.maximum(response.mean(axis=0), 0) ** 2, period)
     start, header_peak_ratio = header_comb(power, SETTINGS.search_samples)
@@ -196,15 +232,19 @@ def find_clock(
     length = SLOTS_PER_SYMBOL * SETTINGS.search_samples
     share = cv2.blur(weight / (weight + 1), (length, 1), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
     by_column = folded(2 * response - share, period)
-    delays = _delays(by_column, start)
+    # Through a long exposure, delays of single columns do not stand out.
+    delays = np.zeros(len(light)) if is_long else _delays(by_column, start)
     staggered_start, staggered_ratio = _staggered_comb(by_column)
     is_clearer = header_peak_ratio < min(staggered_ratio, SETTINGS.clear_header_lead)
-    if is_clearer or np.count_nonzero(delays) > delays.size * SETTINGS.many_columns:
+    if not is_long and (is_clearer or np.count_nonzero(delays) > delays.size * SETTINGS.many_columns):
         delays = _delays(by_column, staggered_start)
         middle = float(np.median(delays[delays != 0])) if delays.any() else 0.0
         start = staggered_start + middle * SETTINGS.search_samples
         delays = np.where(delays != 0, delays - middle, 0.0)
         header_peak_ratio = max(header_peak_ratio, staggered_ratio)
+    if is_long:
+        # A difference shows the last slot of its exposures.
+        start += (exposure_slots - 1) / 2 * SETTINGS.search_samples
     row0 = top + start * step
     before = int(np.ceil((row0 - top) / rows_per_slot))
     n_slots = before + int(np.ceil((bottom - row0) / rows_per_slot))

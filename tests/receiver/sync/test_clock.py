@@ -338,3 +338,14 @@ def test_a_dark_row_of_a_clipped_picture_has_noise() -> None:
     rng = np.random.default_rng(1)
     profiles = row_profiles(random_link(rng, [5] * 4, 5), Shot(), rng)
     assert noise_of(replace(profiles, noise_floor=0.0)) == pytest.approx(1e-7**0.5)
+
+
+@pytest.mark.parametrize("exposure_slots", [2.5, 3.5, 5.0, 8.0])
+def test_headers_are_found_through_long_exposures(exposure_slots: float) -> None:
+    rng = np.random.default_rng(44)
+    link = random_link(rng, rng.integers(3, 8, 20).tolist(), 5)
+    shot = Shot(rows_per_slot=7.3, exposure_slots=exposure_slots, n_rows=1000, texture=0.4, start_slot=133.0)
+    found = found_clock(row_profiles(link, shot, rng), shot, link.packet_slots)
+    assert abs(start_error(found, shot)) < 0.3
+    assert found.header_peak_ratio > 1.3
+    assert not found.delay_slots.any()

@@ -1,0 +1,97 @@
+"""Samples for the joint detection of slots and picture: light relative to its local mean, copies side by side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.numerics import box_sums
+from rxcli.protocol import SLOTS_PER_SYMBOL
+from rxcli.receiver.channel.settings import SETTINGS
+from rxcli.receiver.light import Crosstalk, NoiseModel, exposed_from
+from rxcli.types import BurstSamples, Clock, Float32Array, IntArray, SlotSamples
+
+
+def by_start(clock: Clock) -> Clock:
+    """The clock whose samples are ordered by the start of their exposure instead of its centre."""
+    return replace(clock, row0=clock.row0 + clock.exposure_slots / 2 * clock.rows_per_slot)
+
+
+def burst_samples(
+    samples: SlotSamples,
+    clock: Clock,
+    black_level: float,
+    noise: NoiseModel,
+    crosstalk: Crosstalk,
+    columns: IntArray,
+    lit: Float32Array | None = None,
+) -> BurstSamples:
+    """Samples of the bursts of some columns.
+
+    Args:
+        samples: of all columns, see `by_start`.
+        clock: the clock, its copies assigned to bursts.
+        black_level: light of a dark slot.
+        noise: of a sample.
+        crosstalk: of the strips.
+        columns: numbers of the columns to detect.
+        lit: (C, N) probability that each slot is lit, all columns; None: unknown, the light itself serves.
+    """
+    q = samples.samples_per_slot
+    above = (samples.light - np.float32(black_level)) * samples.valid
+    around = SLOTS_PER_SYMBOL * q
+    mean = box_sums(above, around) / np.maximum(box_sums(samples.valid, around), 1)
+    mean = np.maximum(mean, np.float32(SETTINGS.min_level_sigmas * noise.sigma))
+    light = np.asarray(above / mean, np.float32)
+    ahead = np.diff(clock.delay_slots) * q if clock.delay_slots.any() else None
+    own = own_light(light) if lit is None else light_of(lit, clock.exposure_slots, q)
+    neighbours = crosstalk.from_neighbours(own, columns, ahead)
+    light, mean, valid = light[columns], mean[columns], samples.valid[columns]
+    variance = noise.variance(above[columns]) / np.square(mean)
+    variance += np.square(light) * np.float32(SETTINGS.relative_error**2)
+
+    def lanes(values: NDArray[np.floating[Any]]) -> Float32Array:
+        return _by_lane(values, clock, q)
+
+    visible = lanes(valid)
+    scale = -(lanes(np.log(mean)) * visible).sum(axis=(0, 1, 3), dtype=np.float64) / q
+    return BurstSamples(
+        light=lanes(light),
+        noise=np.where(visible > 0, lanes(variance), np.float32(1)),
+        valid=visible,
+        neighbours=lanes(neighbours),
+        own=np.tile(crosstalk.shares[:, 1].astype(np.float32), int(np.bincount(clock.burst).max())),
+        exposure_slots=clock.exposure_slots,
+        log_scale=scale,
+        n_bursts=int(clock.burst.max()) + 1,
+    )
+
+
+def _by_lane(values: NDArray[np.floating[Any]], clock: Clock, q: int) -> Float32Array:
+    """(P, Q, B * C, K * S) values of the copies of each burst side by side, from (C, S, N * Q)."""
+    by_copy = clock.to_copies(np.moveaxis(values.reshape(*values.shape[:2], -1, q), -1, 0))
+    n_bursts, most = int(clock.burst.max()) + 1, int(np.bincount(clock.burst).max())
+    n_columns, n_strips = values.shape[:2]
+    out = np.zeros((clock.packet_slots, q, n_bursts, n_columns, most, n_strips), np.float32)
+    for burst in range(n_bursts):
+        for place, copy in enumerate(np.flatnonzero(clock.burst == burst)):
+            out[:, :, burst, :, place] = by_copy[:, :, :, copy].transpose(3, 0, 1, 2)
+    return out.reshape(clock.packet_slots, q, n_bursts * n_columns, most * n_strips)
+
+
+def own_light(light: Float32Array) -> Float32Array:
+    """(C, n) light of each column over its mean lit light, from the middle strips (C, S, n) relative to their mean."""
+    n_strips = light.shape[1]
+    third = n_strips // 3
+    return np.asarray(np.clip(light[:, third : n_strips - third].mean(axis=1) / 2, 0, 1), np.float32)
+
+
+def light_of(lit: Float32Array, exposure_slots: float, samples_per_slot: int) -> Float32Array:
+    """(C, N * Q) share of lit slots (C, N) in exposures by their start; 0.5 beyond the end."""
+    taps = exposed_from(exposure_slots, samples_per_slot)
+    padded = np.pad(lit, ((0, 0), (0, taps.shape[1] - 1)), constant_values=0.5)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, taps.shape[1], axis=1)
+    return np.asarray((windows @ taps.T.astype(np.float32)).reshape(len(lit), -1), np.float32)

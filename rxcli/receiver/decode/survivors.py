@@ -1,0 +1,339 @@
+"""Joint detection of slots and picture: a trellis whose paths each follow the picture (per-survivor processing).
+
+Where every sample sees many slots, the picture behind a slot cannot be predicted from its neighbours before these are
+decided. So each path through the trellis, given its slots, estimates the picture of every strip and copy by a Kalman
+filter with a heavy-tailed error (Raheli, Polydoros, Tzou, IEEE Trans. Commun. 43(2/3/4), 1995), and is judged by how
+well it predicts the next sample. Paths that agree in all slots that still matter are merged, unlikely ones are dropped.
+A backward recursion over the remaining paths gives the posterior of every symbol (Anastasopoulos, Chugg, IEEE
+Trans. Commun. 48(10), 2000).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.numerics import TINY
+from rxcli.protocol import (
+    HEADER,
+    PREAMBLE_SLOTS,
+    SLOTS_PER_SYMBOL,
+    WEIGHTS,
+    bits_per_symbol,
+    codebook,
+    dimming_symbol,
+    slot_patterns,
+)
+from rxcli.receiver.decode.settings import SURVIVORS, SurvivorSettings
+from rxcli.receiver.light import exposed_from
+from rxcli.types import BurstPosteriors, BurstSamples, Float32Array, FloatArray, IntArray
+
+#: Log probability of what cannot be.
+_NEVER = -1e9
+#: Number of bits of a path's slots of a path as a number; the bits of a word.
+_RECENT, _WORD = (1 << 2 * SLOTS_PER_SYMBOL) - 1, (1 << SLOTS_PER_SYMBOL) - 1
+#: Books of words: header, codebooks by weight, dimming symbols, arbitrary slots.
+_HEADER, _DIMMING, _ARBITRARY = 0, len(WEIGHTS) + 1, len(WEIGHTS) + 2
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """What the backward recursion needs of one slot: J branches from I paths; for every lane."""
+
+    #: (I',) paths with branches and their first branches; number of paths, I.
+    origins: IntArray
+    starts: IntArray
+    n_paths: int
+    #: (lanes, J) path that a branch leads to, -1 if it was dropped; and its log-likelihood.
+    target: IntArray
+    gain: FloatArray
+
+
+@dataclass(slots=True)
+class _Paths:
+    """Surviving paths; arrays (lanes, paths) or (lanes, paths, samples' strips)."""
+
+    #: The last slots as a number, and the weight (0 before the dimming symbol).
+    slots: IntArray
+    w: IntArray
+    log_likelihood: FloatArray
+    #: Picture relative to the local light, and its variance.
+    picture: Float32Array
+    variance: Float32Array
+
+    def taken(self, index: IntArray) -> _Paths:
+        """The paths with the given numbers, (lanes, n)."""
+        lane = np.arange(len(index))[:, None]
+        return _Paths(*(getattr(self, field.name)[lane, index] for field in fields(self)))
+
+
+def detect(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> BurstPosteriors:
+    """Posteriors of bursts from their samples; `header_llr` is 0."""
+    n_bursts, n_columns = samples.n_bursts, samples.n_columns
+    paths, steps, ends = _forward(samples, settings, is_free=False)
+    log_evidence = np.logaddexp.reduce(paths.log_likelihood, axis=1) + samples.log_scale * settings.information
+    words = _backward(steps, ends, np.zeros_like(paths.log_likelihood))
+    # One weight for all bursts of a column.
+    by_weight = [_weight_log_prob(*word) for word in words[:1]]
+    w_log_prob = by_weight[0].reshape(n_bursts, n_columns, -1).sum(axis=0) if by_weight else np.zeros((n_columns, 9))
+    w_log_prob = w_log_prob - np.logaddexp.reduce(w_log_prob, axis=1, keepdims=True)
+    w = w_log_prob.argmax(axis=1) + 1
+    shape = (n_bursts, n_columns, len(words))
+    lit = np.empty((n_bursts, n_columns, samples.light.shape[0]), np.float32)
+    index, log_prob = np.zeros(shape, np.int64), np.zeros(shape)
+    bit_llr = np.full((*shape, 7), np.nan)
+    for weight in np.unique(w).tolist():
+        columns = np.flatnonzero(w == weight)
+        posterior = _word_posteriors(words, weight, (n_bursts, n_columns))[:, columns]
+        lit[:, columns, :PREAMBLE_SLOTS] = np.concatenate([HEADER, dimming_symbol(weight)])
+        lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(weight)).reshape(n_bursts, columns.size, -1)
+        index[:, columns] = best = posterior.argmax(axis=-1)
+        rest = posterior.copy()
+        np.put_along_axis(rest, best[..., None], 0.0, -1)
+        log_prob[:, columns] = np.log1p(-np.minimum(rest.sum(axis=-1), 1 - 1 / posterior.shape[-1]))
+        bits = slot_patterns(bits_per_symbol(weight) - 1)
+        p_one, p_zero = posterior @ bits, posterior @ (1 - bits)
+        bit_llr[:, columns, :, : bits.shape[1]] = np.log(np.maximum(p_one, TINY)) - np.log(np.maximum(p_zero, TINY))
+    evidence = log_evidence.reshape(n_bursts, n_columns).sum(axis=0)
+    header_llr = np.zeros((n_bursts, n_columns))
+    return BurstPosteriors(w, w_log_prob, evidence, lit, index, log_prob, bit_llr, header_llr)
+
+
+def log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> float:
+    """Log evidence of packets in all columns together; see `BurstPosteriors.log_evidence`."""
+    paths, _, _ = _forward(samples, settings, is_free=False)
+    return float(
+        np.logaddexp.reduce(paths.log_likelihood, axis=1).sum() + samples.log_scale.sum() * settings.information
+    )
+
+
+def free_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> FloatArray:
+    """(C,) log evidence of arbitrary slots, all bursts together; see `BurstPosteriors.log_evidence`."""
+    paths, _, _ = _forward(samples, settings, is_free=True)
+    log_evidence = np.logaddexp.reduce(paths.log_likelihood, axis=1) + samples.log_scale * settings.information
+    return np.asarray(log_evidence.reshape(samples.n_bursts, samples.n_columns).sum(axis=0))
+
+
+def _forward(
+    samples: BurstSamples, settings: SurvivorSettings, *, is_free: bool
+) -> tuple[_Paths, list[_Step], list[tuple[int, _Paths]]]:
+    """Extend the paths slot by slot; returns the last paths, the steps and the paths at the end of every symbol."""
+    n_slots = samples.light.shape[0]
+    taps = exposed_from(samples.exposure_slots, samples.light.shape[1])
+    reach = taps.shape[1] - 1
+    levels = (slot_patterns(reach) @ taps.T).T.astype(np.float32)
+    paths = _start(samples, settings)
+    steps: list[_Step] = []
+    ends: list[tuple[int, _Paths]] = []
+    for n in range(n_slots + reach):
+        symbol, place = divmod(n, SLOTS_PER_SYMBOL) if n < n_slots else (0, n - n_slots)
+        is_dimming = symbol == 1 and n < n_slots
+        books = np.full_like(paths.w, _HEADER) if symbol == 0 else np.full_like(paths.w, _DIMMING)
+        books = books if symbol < 2 else paths.w
+        origin, branches, gain = _branches(paths, np.full_like(books, _ARBITRARY) if is_free else books, place)
+        if is_dimming and place == SLOTS_PER_SYMBOL - 1 and not is_free:
+            branches.w = _n_lit()[branches.slots & _WORD]
+            if samples.w_log_prior is not None:
+                gain = gain + np.take_along_axis(samples.w_log_prior, branches.w - 1, 1)
+        if n >= reach:
+            gain = gain + settings.information * _update(branches, samples, n - reach, levels, settings)
+        branches.log_likelihood = branches.log_likelihood + gain
+        n_recent = max(reach, place + 1) if n < n_slots and not is_free else reach
+        target, remaining = _merged(branches, n_recent, settings)
+        starts = np.flatnonzero(np.diff(origin, prepend=-1))
+        steps.append(_Step(origin[starts], starts, paths.w.shape[1], target, gain))
+        paths = remaining
+        if PREAMBLE_SLOTS <= n < n_slots and place == SLOTS_PER_SYMBOL - 1:
+            ends.append((n, paths))
+    return paths, steps, ends
+
+
+def _start(samples: BurstSamples, settings: SurvivorSettings) -> _Paths:
+    lanes, n_strips = samples.light.shape[2:]
+    picture = np.full((lanes, 1, n_strips), 2.0, np.float32)
+    none = np.zeros((lanes, 1), np.int64)
+    variance = np.float32(settings.first_deviation**2) * np.square(picture)
+    return _Paths(none, none, np.zeros((lanes, 1)), picture, variance)
+
+
+def _branches(paths: _Paths, books: IntArray, place: int) -> tuple[IntArray, _Paths, FloatArray]:
+    """Both next slots of every path.
+
+    Args:
+        paths: I paths.
+        books: (lanes, I) the book of the current word of each.
+        place: slots of that word that a path has.
+
+    Returns:
+        (J,) the path that each branch extends; the branches, only where a lane allows them; (lanes, J) the log
+        probability of their slot.
+    """
+    log_words = _log_words()
+    begun = paths.slots & ((1 << place) - 1)
+    before = log_words[books, place, begun]
+    gain = np.stack([log_words[books, place + 1, 2 * begun + slot] - before for slot in (0, 1)], axis=2)
+    gain = gain.reshape(len(gain), -1)
+    used = np.flatnonzero((gain > _NEVER / 2).any(axis=0))
+    origin = used >> 1
+    out = paths.taken(np.broadcast_to(origin, (len(gain), origin.size)))
+    out.slots = ((out.slots << 1) | (used & 1)) & _RECENT
+    return origin, out, gain[:, used]
+
+
+def _update(
+    branches: _Paths, samples: BurstSamples, slot: int, levels: Float32Array, settings: SurvivorSettings
+) -> FloatArray:
+    """Log-likelihood of the samples whose exposure starts in `slot`; moves the picture of the branches."""
+    window = branches.slots & (levels.shape[1] - 1)
+    nu, q = np.float32(settings.degrees), samples.light.shape[1]
+    drift = np.float32(settings.drift_per_slot**2 / q)
+    picture, variance = branches.picture, branches.variance
+    total = np.zeros(window.shape, np.float32)
+    for place in range(q):
+        valid = samples.valid[slot, place][:, None]
+        if not valid.any():
+            continue
+        noise = samples.noise[slot, place][:, None]
+        light: Float32Array = samples.own * levels[place][window][..., None]
+        light += samples.neighbours[slot, place][:, None]
+        variance = np.asarray(variance + drift * np.square(picture), np.float32)
+        error = samples.light[slot, place][:, None] - light * picture
+        power = np.square(light)
+        error_variance = power * variance
+        error_variance += noise
+        squared = np.square(error)
+        squared /= error_variance
+        # Student-t: error_variance**-1/2 (1 + squared / nu)**-(nu + 1) / 2, with nu = 3/2 by products and one root.
+        wide = squared / nu
+        wide += 1
+        density = np.square(wide)
+        density *= np.sqrt(wide)
+        density *= error_variance
+        np.log(density, out=density)
+        density *= valid
+        total -= density.sum(axis=-1)
+        # An outlier is a jump of the picture.
+        squared += nu
+        squared /= nu + 1
+        np.clip(squared, 1, settings.max_jump, out=squared)
+        variance = np.minimum(variance * squared, settings.max_variance * np.square(picture))
+        power *= variance
+        power += noise
+        gain = light * variance
+        gain /= power
+        gain *= valid
+        picture = picture + gain * error
+        np.clip(picture, settings.min_picture, settings.max_picture, out=picture)
+        gain *= light
+        variance = np.maximum(variance * (1 - gain), np.float32(settings.min_variance))
+    branches.picture, branches.variance = picture, variance
+    return np.asarray(total / (2 * q), np.float64)
+
+
+def _merged(branches: _Paths, n_recent: int, settings: SurvivorSettings) -> tuple[IntArray, _Paths]:
+    """Merge branches that agree in weight and in the last `n_recent` slots, and keep the likeliest.
+
+    Returns:
+        (lanes, J) the path that a branch is part of, -1 if it was dropped; the paths.
+    """
+    likelihood = branches.log_likelihood
+    lanes, n_branches = likelihood.shape
+    lane = np.arange(lanes)[:, None]
+    key = (branches.w << 2 * SLOTS_PER_SYMBOL) | (branches.slots & ((1 << n_recent) - 1))
+    order = np.lexsort((-likelihood, key))
+    ordered = np.take_along_axis(key, order, 1)
+    is_first = np.ones((lanes, n_branches), bool)
+    is_first[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
+    number = is_first.cumsum(axis=1) - 1
+    n_groups = int(number[:, -1].max()) + 1
+    group = np.empty_like(number)
+    np.put_along_axis(group, order, number, 1)
+    row, place = np.nonzero(is_first)
+    best = np.zeros((lanes, n_groups), np.int64)
+    best[row, number[row, place]] = order[row, place]
+    top = likelihood.max(axis=1, keepdims=True)
+    relative = np.exp(np.maximum(likelihood - top, -700))
+    total = np.bincount((lane * n_groups + group).ravel(), relative.ravel(), lanes * n_groups).reshape(lanes, n_groups)
+    total = np.log(np.maximum(total, TINY**10)) + top
+    n_chosen = min(settings.max_paths, int((total > top - settings.max_lag).sum(axis=1).max()), n_groups)
+    chosen = np.broadcast_to(np.arange(n_groups), (lanes, n_groups))
+    if n_chosen < n_groups:
+        chosen = np.argpartition(-total, n_chosen - 1, axis=1)[:, :n_chosen]
+    place_of = np.full((lanes, n_groups), -1)
+    np.put_along_axis(place_of, chosen, np.broadcast_to(np.arange(n_chosen), chosen.shape), 1)
+    paths = branches.taken(np.take_along_axis(best, chosen, 1))
+    # The remaining paths stand for the dropped ones: where nothing is visible, all are equally likely.
+    paths.log_likelihood = np.take_along_axis(total, chosen, 1)
+    paths.log_likelihood += np.logaddexp.reduce(total, axis=1, keepdims=True)
+    paths.log_likelihood -= np.logaddexp.reduce(np.take_along_axis(total, chosen, 1), axis=1, keepdims=True)
+    return np.take_along_axis(place_of, group, 1), paths
+
+
+def _backward(
+    steps: list[_Step], ends: list[tuple[int, _Paths]], after: FloatArray
+) -> list[tuple[FloatArray, IntArray, IntArray]]:
+    """Posterior, weight and word of the paths at the end of every symbol, (lanes, paths) each."""
+    out: list[tuple[FloatArray, IntArray, IntArray]] = []
+    pending = list(ends)
+    for n in range(len(steps) - 1, PREAMBLE_SLOTS - 1, -1):
+        if pending and pending[-1][0] == n:
+            paths = pending.pop()[1]
+            posterior = paths.log_likelihood + after
+            posterior = np.exp(posterior - posterior.max(axis=1, keepdims=True))
+            posterior /= posterior.sum(axis=1, keepdims=True)
+            out.append((posterior, paths.w, paths.slots & _WORD))
+        step = steps[n]
+        gain = step.gain + np.take_along_axis(after, np.maximum(step.target, 0), 1)
+        gain[step.target < 0] = _NEVER
+        top = gain.max(axis=1, keepdims=True)
+        total = np.add.reduceat(np.exp(gain - top), step.starts, axis=1)
+        after = np.full((len(gain), step.n_paths), _NEVER)
+        after[:, step.origins] = np.log(np.maximum(total, TINY**10)) + top
+        after -= after.max(axis=1, keepdims=True)
+    return out[::-1]
+
+
+def _weight_log_prob(posterior: FloatArray, w: IntArray, _: IntArray) -> FloatArray:
+    """(lanes, 9) log probability of each weight."""
+    by_weight = np.stack([(posterior * (w == weight)).sum(axis=1) for weight in WEIGHTS], axis=1)
+    return np.asarray(np.log(np.maximum(by_weight, TINY)))
+
+
+def _word_posteriors(
+    words: list[tuple[FloatArray, IntArray, IntArray]], weight: int, shape: tuple[int, int]
+) -> FloatArray:
+    """(B, C, N, words) posterior of the words of a weight, uniform where no path of that weight is left."""
+    place_of = np.full(_WORD + 1, -1)
+    place_of[codebook(weight) @ (1 << np.arange(SLOTS_PER_SYMBOL - 1, -1, -1))] = np.arange(len(codebook(weight)))
+    out = np.empty((shape[0] * shape[1], len(words), len(codebook(weight))))
+    lane = np.arange(len(out))[:, None]
+    for number, (posterior, w, word) in enumerate(words):
+        # A little for every word, since paths that were dropped are not impossible.
+        of_words = np.full((len(out), out.shape[-1]), TINY)
+        place = place_of[word]
+        np.add.at(of_words, (lane, np.maximum(place, 0)), np.where((w == weight) & (place >= 0), posterior, 0.0))
+        out[:, number] = of_words / of_words.sum(axis=1, keepdims=True)
+    return out.reshape(*shape, *out.shape[1:])
+
+
+@cache
+def _n_lit() -> NDArray[np.int64]:
+    """(1024,) number of lit slots of a word."""
+    return np.asarray(slot_patterns(SLOTS_PER_SYMBOL - 1).sum(axis=1), np.int64)
+
+
+@cache
+def _log_words() -> FloatArray:
+    """(books, 11, 1024) log of the number of a book's words that begin with some slots, by their number and value."""
+    books = [[HEADER], *(codebook(w) for w in WEIGHTS), [dimming_symbol(w) for w in WEIGHTS]]
+    count = np.zeros((len(books) + 1, SLOTS_PER_SYMBOL + 1, _WORD + 1))
+    for number, book in enumerate(books):
+        values = np.array(book, np.int64) @ (1 << np.arange(SLOTS_PER_SYMBOL - 1, -1, -1))
+        for length in range(SLOTS_PER_SYMBOL + 1):
+            np.add.at(count[number, length], values >> (SLOTS_PER_SYMBOL - length), 1)
+    for length in range(SLOTS_PER_SYMBOL + 1):
+        count[_ARBITRARY, length, : 1 << length] = 2.0 ** (SLOTS_PER_SYMBOL - length)
+    return np.where(count > 0, np.log(np.maximum(count, 1)), _NEVER)

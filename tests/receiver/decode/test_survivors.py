@@ -1,0 +1,139 @@
+"""The joint detector against enumeration of all words, on smeared light, and where nothing is visible."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rxcli.protocol import HEADER, WEIGHTS, bits_per_symbol, codebook, dimming_symbol
+from rxcli.receiver.decode.settings import SURVIVORS
+from rxcli.receiver.decode.survivors import detect, free_log_evidence, log_evidence
+from rxcli.receiver.light import exposed_from
+from rxcli.types import BurstSamples
+
+Q, STRIPS = 2, 4
+EVERY_PATH = replace(SURVIVORS, max_paths=2000, max_lag=1e6)
+
+
+def packet(index: NDArray[np.int64], w: int) -> NDArray[np.int64]:
+    """Slots of a packet and of the next header."""
+    payload = codebook(w)[index].ravel()
+    return np.concatenate([HEADER, dimming_symbol(w), payload, HEADER]).astype(np.int64)
+
+
+def exposed(slots: NDArray[np.int64], exposure_slots: float, n_slots: int) -> NDArray[np.float64]:
+    """(n_slots, Q) share of lit slots in exposures by their start."""
+    taps = exposed_from(exposure_slots, Q)
+    return np.stack([taps @ slots[n : n + taps.shape[1]] for n in range(n_slots)])
+
+
+def samples(
+    slots: list[NDArray[np.int64]], exposure_slots: float, rng: np.random.Generator, noise: float, texture: float
+) -> BurstSamples:
+    """Samples of columns that do not light each other, through a picture that steps from slot to slot."""
+    n = len(slots[0]) - len(HEADER)
+    light = np.stack([exposed(one, exposure_slots, n) for one in slots], axis=2)[..., None]
+    steps = rng.normal(0, texture / np.sqrt(Q), (n * Q, len(slots), STRIPS)).cumsum(axis=0)
+    picture = np.exp(steps).reshape(n, Q, len(slots), STRIPS)
+    received = light * picture * 1.9 + rng.normal(0, noise, picture.shape)
+    like = np.ones(picture.shape, np.float32)
+    return BurstSamples(
+        light=received.astype(np.float32),
+        noise=np.float32(noise**2) * like,
+        valid=like,
+        neighbours=0 * like,
+        own=np.ones(STRIPS, np.float32),
+        exposure_slots=exposure_slots,
+        log_scale=np.zeros(len(slots)),
+        n_bursts=1,
+    )
+
+
+@pytest.mark.parametrize("exposure_slots", [0.5, 1.0, 2.4, 4.0, 6.5, 8.0])
+def test_smeared_slots_are_read(exposure_slots: float) -> None:
+    rng = np.random.default_rng(3)
+    weights = [2, 4, 5, 6, 8]
+    index = [rng.integers(0, 1 << bits_per_symbol(w), 4) for w in weights]
+    found = detect(
+        samples([packet(i, w) for i, w in zip(index, weights, strict=True)], exposure_slots, rng, 0.01, 0.02)
+    )
+    assert found.w.tolist() == weights
+    assert np.array_equal(found.index[0], index)
+    assert found.log_prob.sum(axis=2).min() > -0.05
+    sent = np.stack([packet(i, w)[: -len(HEADER)] for i, w in zip(index, weights, strict=True)])
+    assert np.abs(found.lit[0] - sent).max() < 0.05
+
+
+def test_a_picture_that_jumps_is_followed() -> None:
+    rng = np.random.default_rng(5)
+    index = rng.integers(0, 128, (6, 5))
+    burst = samples([packet(i, 5) for i in index], 3.0, rng, 0.01, 0.03)
+    step = np.where(np.arange(len(burst.light)) < 37, 1, 0.35).astype(np.float32)[:, None, None, None]
+    found = detect(replace(burst, light=burst.light * step, noise=burst.noise))
+    assert (found.index[0] == index).mean() > 0.9
+
+
+def test_posterior_is_that_of_all_words() -> None:
+    """One payload symbol: every path is followed by itself, without trellis, and the posteriors are compared."""
+    rng = np.random.default_rng(8)
+    burst = samples([packet(np.array([77]), 5)], 4.0, rng, 0.06, 0.08)
+    found = detect(burst, EVERY_PATH)
+    paths = [(w, k) for w in WEIGHTS for k in range(1 << bits_per_symbol(w))]
+    log = np.array(
+        [path_log_likelihood(burst, packet(np.array([k]), w)) - np.log(1 << bits_per_symbol(w)) for w, k in paths]
+    )
+    log -= np.log(len(WEIGHTS))
+    evidence = float(np.logaddexp.reduce(log))
+    assert log_evidence(burst, EVERY_PATH) == pytest.approx(evidence, abs=0.3)
+    of_five = np.array([value for value, (w, _) in zip(log, paths, strict=True) if w == 5])
+    posterior = np.exp(of_five - np.logaddexp.reduce(of_five))
+    assert found.w[0] == 5
+    assert found.index[0, 0, 0] == posterior.argmax()
+    assert np.exp(found.log_prob[0, 0, 0]) == pytest.approx(posterior.max(), abs=0.03)
+
+
+def path_log_likelihood(burst: BurstSamples, slots: NDArray[np.int64]) -> float:
+    """Log-likelihood of samples given the slots, by a Kalman filter of the picture with heavy tails, as documented."""
+    settings, total = SURVIVORS, 0.0
+    light = exposed(slots, burst.exposure_slots, len(burst.light))
+    picture, variance = np.full(STRIPS, 2.0), np.full(STRIPS, (2 * settings.first_deviation) ** 2)
+    nu = settings.degrees
+    for n in range(len(light)):
+        for place in range(Q):
+            a, noise = light[n, place], burst.noise[n, place, 0]
+            variance = variance + settings.drift_per_slot**2 / Q * picture**2
+            error = burst.light[n, place, 0] - a * picture
+            spread = a * a * variance + noise
+            total += float((-np.log(spread) / 2 - (nu + 1) / 2 * np.log1p(error**2 / spread / nu)).sum())
+            jump = np.clip((nu + error**2 / spread) / (nu + 1), 1, settings.max_jump)
+            variance = np.minimum(variance * jump, settings.max_variance * picture**2)
+            gain = a * variance / (a * a * variance + noise)
+            picture = np.clip(picture + gain * error, settings.min_picture, settings.max_picture)
+            variance = np.maximum(variance * (1 - gain * a), settings.min_variance)
+    return settings.information / Q * total
+
+
+def test_a_symbol_that_nothing_shows_is_open() -> None:
+    rng = np.random.default_rng(9)
+    index = rng.integers(0, 128, (3, 4))
+    burst = samples([packet(i, 5) for i in index], 2.5, rng, 0.01, 0.02)
+    hidden = burst.valid.copy()
+    hidden[38:] = 0
+    found = detect(replace(burst, valid=hidden))
+    assert np.array_equal(found.index[0, :, :1], index[:, :1])
+    assert found.log_prob[0, :, 2:].max() < np.log(0.2)
+
+
+def test_few_paths_are_enough_and_packets_beat_arbitrary_slots() -> None:
+    rng = np.random.default_rng(10)
+    index = rng.integers(0, 128, (4, 5))
+    burst = samples([packet(i, 5) for i in index], 4.0, rng, 0.02, 0.05)
+    few, many = detect(burst), detect(burst, replace(SURVIVORS, max_paths=300, max_lag=80))
+    assert np.array_equal(few.index, many.index)
+    assert (few.log_evidence > free_log_evidence(burst)).all()
+    other = rng.integers(0, 2, (4, 80)).astype(np.int64)
+    noise = samples([np.concatenate([slots, HEADER]) for slots in other], 4.0, rng, 0.02, 0.05)
+    assert (detect(noise).log_evidence < free_log_evidence(noise)).all()
