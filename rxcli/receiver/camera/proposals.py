@@ -15,7 +15,7 @@ import numpy as np
 
 from rxcli.numerics import NORMAL_MEDIAN, TINY, folded, header_correlation, local_mean, peak_offset
 from rxcli.profiles import ScreenProfile
-from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.curvature import likeliest_bend, straightened
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import ColumnStrips, columns_of, joined, levelled
@@ -186,12 +186,44 @@ def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_be
                         packet_slots=length,
                         reversed=bool(is_reversed),
                         curvature=bend,
-                        exposure_slots=exposure or SETTINGS.usual_long_exposure_slots,
+                        exposure_slots=exposure
+                        or _exposure_by_echo(total, rows, length, is_reversed=bool(is_reversed)),
                         score=max(header, 0.0) ** 2 + common,
                         rows_per_slot_sd=rows * rows * strips.pitch / (4 * columns.shape[1]),
                         curvature_sd=np.abs(bend) / 4,
                         stated_exposure_slots=exposure,
                     )
+
+
+def _exposure_by_echo(total: FloatArray, rows_per_slot: float, packet_slots: int, *, is_reversed: bool) -> float:
+    """Exposure, slots: in changes of the light, each header shows again an exposure later, inverted.
+
+    Args:
+        total: (R + 1,) running sum of the columns' mean change.
+        rows_per_slot: rows a slot.
+        packet_slots: slots of a packet.
+        is_reversed: whether rows run against the readout.
+    """
+    step = rows_per_slot / _SAMPLES
+    places = np.arange(int((total.size - 1) / step) + 1) * step
+    response = header_correlation(np.interp(places, np.arange(total.size), total), _SAMPLES) / step
+    period = packet_slots * _SAMPLES
+    if response.size < period:
+        return SETTINGS.usual_long_exposure_slots
+    score = folded(-response[::-1] if is_reversed else response, period)
+    lags = np.arange(-_SAMPLES, 2 * SLOTS_PER_SYMBOL * _SAMPLES)
+    around = score.take(int(score.argmax()) + lags, mode="wrap")
+    header = np.cumsum(np.repeat(2.0 * np.array(HEADER) - 1, _SAMPLES))
+    silence = 3 * SLOTS_PER_SYMBOL * _SAMPLES
+    shape = header_correlation(np.pad(np.pad(header, (1, 0)), (silence, silence), mode="edge"), _SAMPLES)
+    echoes = np.arange(*SETTINGS.echo_slots, 1 / _SAMPLES)
+
+    def likeness(echo_slots: float) -> float:
+        at = silence + lags
+        model = shape[at] - np.interp(at - echo_slots * _SAMPLES, np.arange(shape.size), shape)
+        return float(model @ around / np.linalg.norm(model))
+
+    return float(max(echoes.tolist(), key=likeness))
 
 
 def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:

@@ -47,6 +47,8 @@ class EstimateSettings:
     #: Exposure from which changes of the light are looked at, and the default one, slots.
     long_exposure_slots: float = 2.3
     usual_long_exposure_slots: float = 4.0
+    #: Exposures that the echo of headers is sought at, slots.
+    echo_slots: tuple[float, float] = (1.5, 9.5)
     #: Rows over which bends of the light are taken; limits of a bend, in medians, and of a change, in rms; slots of
     #: the local level.
     bend_lags: tuple[int, ...] = (1, 2, 4, 8)
