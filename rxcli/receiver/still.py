@@ -105,7 +105,7 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     columns = np.arange(len(samples.light))
     by_start = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
 
-    def of_bursts(clock: Clock, lit: Float32Array | None) -> BurstSamples:
+    def of_bursts(clock: Clock, lit: Float32Array | None, columns: NDArray[np.int64] = columns) -> BurstSamples:
         noise, crosstalk = model.noise, model.crosstalk
         return ratios.burst_samples(by_start, clock, model.black_level, noise, crosstalk, columns, lit)
 
@@ -113,12 +113,12 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
     metrics = channel.metrics_of(_llr_of(single.on_grid(alone.lit)), 1)
     lit = single.on_grid(alone.lit)
-    tried, most = [], STILL.max_column_gain
-    for way, _ in sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats):
-        bursts = of_bursts(way, lit)
-        tried.append((way, bursts, survivors.detect(bursts, QUICK_SURVIVORS)))
-    gains = [np.clip(found.log_evidence - tried[0][2].log_evidence, -most, most).sum() for *_, found in tried]
-    clock, bursts, posteriors = tried[int(np.argmax(gains))]
+    ways = [way for way, _ in sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)]
+    some, most = _some(columns), STILL.max_column_gain
+    gains = np.stack([survivors.detect(of_bursts(way, lit, some), QUICK_SURVIVORS).log_evidence for way in ways])
+    clock = ways[int(np.clip(gains - gains[0], -most, most).sum(axis=1).argmax())]
+    bursts = of_bursts(clock, lit)
+    posteriors = survivors.detect(bursts, QUICK_SURVIVORS)
     free = survivors.free_log_evidence(bursts, QUICK_SURVIVORS)
     shape = posteriors.header_llr.shape
     posteriors = replace(posteriors, header_llr=np.broadcast_to((posteriors.log_evidence - free) / shape[0], shape))
@@ -150,6 +150,9 @@ def follow_picture(acquisition: Acquisition, reception: Reception, columns: NDAr
     """Detect slots and picture of some columns jointly, with all strips, given the slots decided so far."""
     clock, q = reception.clock, STILL.coarse_samples
     is_long = reception.free_log_evidence is not None
+    if is_long:
+        clock = _likeliest_exposure(acquisition, reception, columns)
+        reception = replace(reception, clock=clock)
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), q, ratios.by_start(clock))
     lit = clock.on_grid(reception.posteriors.lit)
     if is_long:
@@ -169,6 +172,34 @@ def follow_picture(acquisition: Acquisition, reception: Reception, columns: NDAr
     return replace(reception, posteriors=reception.posteriors.with_columns(columns, found), joint=joint)
 
 
+def _some(columns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """A few of the columns, spread over all."""
+    return columns[np.linspace(0, columns.size - 1, min(STILL.n_judged_columns, columns.size)).round().astype(int)]
+
+
+def _likeliest_exposure(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Clock:
+    """The clock with the exposure that has the largest evidence of packets in some of `columns`.
+
+    The start was found by the ends of exposures, which stay where they are.
+    """
+    lit, some = reception.clock.on_grid(reception.posteriors.lit), _some(columns)
+    every = np.arange(len(reception.snr))
+
+    def evidence(clock: Clock) -> float:
+        samples, model = _view(acquisition, reception, every, STILL.coarse_samples, ratios.by_start(clock))
+        parts = model.black_level, model.noise, model.crosstalk
+        return survivors.log_evidence(ratios.burst_samples(samples, clock, *parts, some, lit), QUICK_SURVIVORS)
+
+    return max((_exposed_for(reception.clock, factor) for factor in STILL.exposure_factors), key=evidence)
+
+
+def _exposed_for(clock: Clock, factor: float) -> Clock:
+    """The clock with another exposure that ends at the same time."""
+    longer = (factor - 1) * clock.exposure_slots
+    row0 = clock.row0 + longer / 2 * clock.rows_per_slot
+    return replace(clock, exposure_slots=clock.exposure_slots + longer, row0=row0)
+
+
 def _likeliest_black_level(
     samples: SlotSamples,
     clock: Clock,
@@ -177,7 +208,7 @@ def _likeliest_black_level(
     lit: Float32Array,
 ) -> float:
     """Black level with the largest evidence of packets in some of `columns`."""
-    some = columns[np.linspace(0, columns.size - 1, STILL.n_judged_columns).round().astype(int)]
+    some = _some(columns)
     levels = np.percentile(samples.light[samples.valid > 0], STILL.dark_percent) * np.array(STILL.dark_shares)
     noise, crosstalk = model.noise, model.crosstalk
 

@@ -34,6 +34,8 @@ class StillSettings:
     #: Shares that are compared by evidence, on some columns.
     dark_shares: tuple[float, ...] = (0.0, 0.4, 0.7, 0.85, 1.0, 1.1)
     n_judged_columns: int = 5
+    #: Exposures that are compared likewise, as factors.
+    exposure_factors: tuple[float, ...] = (0.82, 0.91, 1.0, 1.1, 1.22)
     #: Limit of the log evidence of a column for an assignment of copies to bursts.
     max_column_gain: float = 40.0
     #: Least log probability of a weight by the initial pass that the joint detection starts from.
