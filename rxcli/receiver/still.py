@@ -105,7 +105,7 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     columns = np.arange(len(samples.light))
     by_start = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
 
-    def of_bursts(clock: Clock, lit: Float32Array | None, columns: NDArray[np.int64] = columns) -> BurstSamples:
+    def of_bursts(clock: Clock, lit: Float32Array | None) -> BurstSamples:
         noise, crosstalk = model.noise, model.crosstalk
         return ratios.burst_samples(by_start, clock, model.black_level, noise, crosstalk, columns, lit)
 
@@ -113,10 +113,7 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
     metrics = channel.metrics_of(_llr_of(single.on_grid(alone.lit)), 1)
     lit = single.on_grid(alone.lit)
-    ways = [way for way, _ in sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)]
-    some, most = _some(columns), STILL.max_column_gain
-    gains = np.stack([survivors.detect(of_bursts(way, lit, some), QUICK_SURVIVORS).log_evidence for way in ways])
-    clock = ways[int(np.clip(gains - gains[0], -most, most).sum(axis=1).argmax())]
+    clock = sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)[0][0]
     bursts = of_bursts(clock, lit)
     posteriors = survivors.detect(bursts, QUICK_SURVIVORS)
     free = survivors.free_log_evidence(bursts, QUICK_SURVIVORS)
@@ -151,12 +148,10 @@ def follow_picture(acquisition: Acquisition, reception: Reception, columns: NDAr
     clock, q = reception.clock, STILL.coarse_samples
     is_long = reception.free_log_evidence is not None
     if is_long:
-        clock = _likeliest_exposure(acquisition, reception, columns)
-        reception = replace(reception, clock=clock)
+        reception = _refined(acquisition, reception, columns)
+        clock = reception.clock
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), q, ratios.by_start(clock))
     lit = clock.on_grid(reception.posteriors.lit)
-    if is_long:
-        model = replace(model, black_level=_likeliest_black_level(samples, clock, model, columns, lit))
     bursts = ratios.burst_samples(samples, clock, model.black_level, model.noise, model.crosstalk, columns, lit)
     if not is_long:
         prior = np.maximum(reception.posteriors.w_log_prob[columns], STILL.min_weight_log_prior) / bursts.n_bursts
@@ -174,23 +169,43 @@ def follow_picture(acquisition: Acquisition, reception: Reception, columns: NDAr
 
 def _some(columns: NDArray[np.int64]) -> NDArray[np.int64]:
     """A few of the columns, spread over all."""
-    return columns[np.linspace(0, columns.size - 1, min(STILL.n_judged_columns, columns.size)).round().astype(int)]
+    n_columns = min(STILL.n_judged_columns, columns.size)
+    return np.asarray(columns[np.linspace(0, columns.size - 1, n_columns).round().astype(int)])
 
 
-def _likeliest_exposure(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Clock:
-    """The clock with the exposure that has the largest evidence of packets in some of `columns`.
+def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
+    """The reception with exposure, black level and bursts of the largest evidence in some of `columns`.
 
-    The start was found by the ends of exposures, which stay where they are.
+    The start of packets was found by the ends of exposures, which stay where they are.
     """
-    lit, some = reception.clock.on_grid(reception.posteriors.lit), _some(columns)
-    every = np.arange(len(reception.snr))
+    every, some = np.arange(len(reception.snr)), _some(columns)
+    lit = reception.clock.on_grid(reception.posteriors.lit)
 
-    def evidence(clock: Clock) -> float:
+    def evidence(clock: Clock, levels: list[float]) -> FloatArray:
         samples, model = _view(acquisition, reception, every, STILL.coarse_samples, ratios.by_start(clock))
-        parts = model.black_level, model.noise, model.crosstalk
-        return survivors.log_evidence(ratios.burst_samples(samples, clock, *parts, some, lit), QUICK_SURVIVORS)
+        parts = [
+            ratios.burst_samples(samples, clock, level, model.noise, model.crosstalk, some, lit) for level in levels
+        ]
+        by_lane = survivors.lane_log_evidence(survivors.side_by_side(parts), QUICK_SURVIVORS)
+        return np.asarray(by_lane.reshape(len(levels), -1, some.size).sum(axis=1))
 
-    return max((_exposed_for(reception.clock, factor) for factor in STILL.exposure_factors), key=evidence)
+    level = reception.model.black_level
+    exposed = [_exposed_for(reception.clock, factor) for factor in STILL.exposure_factors]
+    clock = max(exposed, key=lambda clock: float(evidence(clock, [level]).sum()))
+    light = reception.samples.light[reception.samples.valid > 0]
+    levels = [float(np.percentile(light, STILL.dark_percent)) * share for share in STILL.dark_shares]
+    level = levels[int(evidence(clock, levels).sum(axis=1).argmax())]
+    ways = [way for way, _ in sync.possible_bursts(clock, slot_llr(reception.metrics), acquisition.repeats)]
+    gains = np.concatenate([evidence(way, [level]) for way in ways])
+    most = STILL.max_column_gain
+    best = ways[int(np.clip(gains - gains[0], -most, most).sum(axis=1).argmax())]
+    refined = replace(reception, clock=best, model=replace(reception.model, black_level=level))
+    if np.array_equal(best.burst, reception.clock.burst):
+        return refined
+    posteriors = _detect(reception.metrics, best)
+    header_llr = np.repeat(reception.posteriors.header_llr[:1], len(posteriors.header_llr), axis=0)
+    log_evidence = reception.posteriors.log_evidence
+    return replace(refined, posteriors=replace(posteriors, header_llr=header_llr, log_evidence=log_evidence))
 
 
 def _exposed_for(clock: Clock, factor: float) -> Clock:
@@ -198,25 +213,6 @@ def _exposed_for(clock: Clock, factor: float) -> Clock:
     longer = (factor - 1) * clock.exposure_slots
     row0 = clock.row0 + longer / 2 * clock.rows_per_slot
     return replace(clock, exposure_slots=clock.exposure_slots + longer, row0=row0)
-
-
-def _likeliest_black_level(
-    samples: SlotSamples,
-    clock: Clock,
-    model: channel.ObservationModel,
-    columns: NDArray[np.int64],
-    lit: Float32Array,
-) -> float:
-    """Black level with the largest evidence of packets in some of `columns`."""
-    some = _some(columns)
-    levels = np.percentile(samples.light[samples.valid > 0], STILL.dark_percent) * np.array(STILL.dark_shares)
-    noise, crosstalk = model.noise, model.crosstalk
-
-    def evidence(black_level: float) -> float:
-        bursts = ratios.burst_samples(samples, clock, black_level, noise, crosstalk, some, lit)
-        return survivors.log_evidence(bursts, QUICK_SURVIVORS)
-
-    return float(max(levels.tolist(), key=evidence))
 
 
 def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[tuple[Reception, float]]:

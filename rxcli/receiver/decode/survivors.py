@@ -10,8 +10,10 @@ Trans. Commun. 48(10), 2000).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,12 +104,22 @@ def detect(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> Bur
     return BurstPosteriors(w, w_log_prob, evidence, lit, index, log_prob, bit_llr, header_llr)
 
 
-def log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> float:
-    """Log evidence of packets in all columns together; see `BurstPosteriors.log_evidence`."""
+def lane_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> FloatArray:
+    """(lanes,) log evidence of packets in each burst and column; see `BurstPosteriors.log_evidence`."""
     paths, _, _ = _forward(samples, settings, is_free=False)
-    return float(
-        np.logaddexp.reduce(paths.log_likelihood, axis=1).sum() + samples.log_scale.sum() * settings.information
-    )
+    return np.asarray(np.logaddexp.reduce(paths.log_likelihood, axis=1) + samples.log_scale * settings.information)
+
+
+def side_by_side(parts: Sequence[BurstSamples]) -> BurstSamples:
+    """Samples of one shape as lanes of one, since the number of lanes hardly counts for the time."""
+    if len(parts) == 1:
+        return parts[0]
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts], axis=2)
+        for name in ("light", "noise", "valid", "neighbours")
+    }
+    log_scale = np.concatenate([part.log_scale for part in parts])
+    return replace(parts[0], **joined, log_scale=log_scale, n_bursts=len(parts) * parts[0].n_bursts)
 
 
 def free_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> FloatArray:

@@ -13,6 +13,7 @@ from rxcli.receiver.plane import orientation
 from rxcli.receiver.search.cameras import known_camera
 from rxcli.receiver.search.outlines import ON_ITS_SIDE, lean_on_its_side, unreadable_orientation
 from rxcli.receiver.search.refusal import STEADY_LIGHT, likeliest_reason
+from rxcli.receiver.sync.settings import SETTINGS as SYNC
 from rxcli.types import Frame, FrameResult
 
 _UPSIDE_DOWN = (
@@ -25,6 +26,8 @@ _AS_STORED = (
 )
 #: Relative difference of line delays up to which an estimate agrees with a profile, and confidence of a sure packet.
 _SAME_LINE_DELAY, _SURE = 0.01, 0.9
+#: Packets of a long exposure that show that it was stated rightly.
+_PLAIN_LONG = 4
 #: Receives a photograph as it is.
 _Receive = Callable[[FrameCache, ReceiverOptions], Received]
 
@@ -62,13 +65,20 @@ def _receive_stated(cache: FrameCache, options: ReceiverOptions, receive: _Recei
     best = stated = received = receive(cache, options)
     for attempt, estimating in _with_estimates(cache, options):
         # Without a hypothesis of the camera its exposure did not count.
-        if not _gives_few(best.result) or (attempt is not cache and not received.result.search):
+        is_plain = best.n_believable >= _PLAIN_LONG and _is_long(best.result, cache.frame, options)
+        if not _gives_few(best.result) or is_plain or (attempt is not cache and not received.result.search):
             break
         received = receive(attempt, estimating)
         if received.n_believable > best.n_believable and _is_credible(received.result, cache.frame, options):
             message = _difference(cache.frame, options, stated, received, is_exposure=attempt is not cache)
             best = received.with_remark(message)
     return best
+
+
+def _is_long(result: FrameResult, frame: Frame, options: ReceiverOptions) -> bool:
+    """Whether the stated exposure lasts several slots of the screen, so that few packets are as many as expected."""
+    rate_hz = next((screen.slot_rate_hz for screen in options.screens if screen.name == result.screen_profile), 0.0)
+    return (frame.metadata.exposure_s or 0.0) * rate_hz > SYNC.long_exposure_slots
 
 
 def _gives_few(result: FrameResult) -> bool:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rxcli.protocol import HEADER, WEIGHTS, bits_per_symbol, codebook, dimming_symbol
 from rxcli.receiver.decode.settings import SURVIVORS
-from rxcli.receiver.decode.survivors import detect, free_log_evidence, log_evidence
+from rxcli.receiver.decode.survivors import detect, free_log_evidence, lane_log_evidence, side_by_side
 from rxcli.receiver.light import exposed_from
 from rxcli.types import BurstSamples
 
@@ -87,7 +87,8 @@ def test_posterior_is_that_of_all_words() -> None:
     )
     log -= np.log(len(WEIGHTS))
     evidence = float(np.logaddexp.reduce(log))
-    assert log_evidence(burst, EVERY_PATH) == pytest.approx(evidence, abs=0.3)
+    twice = lane_log_evidence(side_by_side([burst, burst]), EVERY_PATH)
+    assert twice == pytest.approx(evidence, abs=0.3)
     of_five = np.array([value for value, (w, _) in zip(log, paths, strict=True) if w == 5])
     posterior = np.exp(of_five - np.logaddexp.reduce(of_five))
     assert found.w[0] == 5
