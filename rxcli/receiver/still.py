@@ -51,21 +51,26 @@ def _may_show_packets(initial: Reception) -> bool:
     return packet_llr(initial) + max(float(initial.posteriors.header_llr.sum()), 0.0) > SETTINGS.min_packets_llr
 
 
-def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception) -> Reception:
-    """Make further passes over doubtful columns.
-
-    Each pass uses more of the light than the previous one and replaces its result.
+def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception, *, adds_up: bool = False) -> Reception:
+    """Make a further pass over doubtful columns, which uses more of the light and replaces the result.
 
     Args:
         acquisition: the clock and the row profiles.
         skip: enabled shortcuts, see `rxcli.options.SKIPS`.
         initial: the initial pass.
+        adds_up: whether the metrics are to be added to those of other frames.
     """
     reception, n_columns = initial, len(initial.snr)
     candidates = doubtful_columns(initial) if "certain_columns" in skip else np.arange(n_columns)
     lit = candidates[~dark_columns(initial.snr)[candidates]] if "dark_columns" in skip else candidates
     skipped = {"certain_columns": n_columns - candidates.size, "dark_columns": candidates.size - lit.size}
-    if lit.size:
+    # Joint detection gives no metrics, and developing mixes rows that are few per slot.
+    by_slot = adds_up or initial.clock.rows_per_slot < STILL.min_joint_rows
+    if lit.size and by_slot and initial.free_log_evidence is None:
+        reception, _ = without_row_noise(acquisition, reception, lit)
+        if (doubtful := np.intersect1d(lit, doubtful_columns(reception))).size:
+            reception, _ = without_row_noise(acquisition, reception, doubtful)
+    elif lit.size:
         reception = follow_picture(acquisition, reception, lit)
     return replace(reception, skipped={name: count for name, count in skipped.items() if count})
 
@@ -111,16 +116,20 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
 
     single = replace(clock, burst=np.arange(clock.n_copies))
     alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
-    metrics = channel.metrics_of(_llr_of(single.on_grid(alone.lit)), 1)
+    metrics = channel.metrics_of(_llr_of(single.on_grid(alone.lit)), model.exposure.isi_memory)
     lit = single.on_grid(alone.lit)
     clock = sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)[0][0]
     bursts = of_bursts(clock, lit)
     posteriors = survivors.detect(bursts, QUICK_SURVIVORS)
     free = survivors.free_log_evidence(bursts, QUICK_SURVIVORS)
-    shape = posteriors.header_llr.shape
-    posteriors = replace(posteriors, header_llr=np.broadcast_to((posteriors.log_evidence - free) / shape[0], shape))
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
     snr = _joint_snr(model.over_black(samples), samples, model, clock)
+    # Noise is no evidence, and leaves most symbols open.
+    share = (posteriors.log_prob > np.log(0.5)).mean(axis=(0, 2)) * ~dark_columns(snr)
+    llr = (posteriors.log_evidence - free) * share
+    shape = posteriors.header_llr.shape
+    posteriors = replace(posteriors, header_llr=np.broadcast_to(llr / shape[0], shape))
+    free = posteriors.log_evidence - llr
     joint = np.ones(len(columns), bool)
     return Reception(clock, samples, contrast, posteriors, snr, model, metrics, joint, free)
 
@@ -210,7 +219,7 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
 
 def _exposed_for(clock: Clock, factor: float) -> Clock:
     """The clock with another exposure that ends at the same time."""
-    longer = (factor - 1) * clock.exposure_slots
+    longer = min((factor - 1) * clock.exposure_slots, SYNC.max_exposure_slots - clock.exposure_slots)
     row0 = clock.row0 + longer / 2 * clock.rows_per_slot
     return replace(clock, exposure_slots=clock.exposure_slots + longer, row0=row0)
 
@@ -311,9 +320,9 @@ def apply_autoencoder(
         return reception, frozenset(), {**report, "columns": 0, "message": str(error)}
     corrected = by_slot.metrics[columns] + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
     after = _with_metrics(by_slot, columns, corrected, by_slot.snr[columns])
-    improved = columns[
-        after.best_confidence(frozenset(columns.tolist()))[columns] > reception.best_confidence()[columns]
-    ]
+    surest = after.best_confidence(frozenset(columns.tolist()))
+    is_surer = surest > np.maximum(reception.best_confidence(), STILL.min_corrected_confidence)
+    improved = columns[is_surer[columns]]
     report.update(model=denoiser.name, kept=improved.size)
     is_improved = np.zeros(n_columns, bool)
     is_improved[improved] = True

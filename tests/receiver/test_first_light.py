@@ -55,7 +55,7 @@ def test_the_same_in_all_columns_is_received_and_named(numbers: list[int], n_fra
     sent = {np.packbits(payload(number)).tobytes().hex() for number in numbers}
     right = {column.column for column in result.columns for packet in column.packets if packet.payload in sent}
     assert len(right) >= 18
-    assert result.message == "all columns send the same"
+    assert (result.message or "").endswith("all columns send the same")
 
 
 @pytest.mark.parametrize("n_frames", [1, 3])
@@ -67,7 +67,7 @@ def test_one_column_alone_is_received_and_named(n_frames: int) -> None:
     assert "one column alone sends" in (result.message or "")
     for known in (True, False) if n_frames == 1 else ():
         (result,) = received(slots, 1, known=known, corners=True)
-        assert result.message == "column 7 alone sends"
+        assert (result.message or "").endswith("column 7 alone sends")
 
 
 @pytest.mark.parametrize(("n_lit", "says"), [(4, "lit without slots"), (2, "switched on and off steadily")])

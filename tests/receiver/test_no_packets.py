@@ -37,7 +37,7 @@ def _first(headers: float) -> Reception:
     )
     nothing = np.zeros((3, 261, 4))
     snr = np.zeros((3, 260), np.float32)
-    return Reception(CLOCK, None, (snr, snr), posteriors, snr, None, nothing)  # type: ignore[arg-type]
+    return Reception(CLOCK, None, (snr, snr), posteriors, snr, None, nothing, np.zeros(3, bool))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

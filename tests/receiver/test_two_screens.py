@@ -16,7 +16,7 @@ from rxcli.results.report import format_frame
 from rxcli.types import Frame, FrameResult
 
 #: Packets of each screen, of which the rows show 19 and 11.
-LEFT, RIGHT = 15, 7
+LEFT, RIGHT = 14, 7
 
 
 @pytest.fixture(scope="module")

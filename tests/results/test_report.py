@@ -16,7 +16,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from rxcli.errors import ExitCode, InputError, UsageError
+from rxcli.errors import ExitCode, UsageError
 from rxcli.results.record import from_record, to_json_line, to_record
 from rxcli.results.report import format_frame, headline, printable_name
 from rxcli.results.summary import Limits, SourceSummary, exit_code, format_summary, write_junit, write_summary
@@ -251,7 +251,7 @@ def test_summary_files(suffix: str, tmp_path: Path) -> None:
     assert (first["source"], second["ber"], int(second["exit_code"])) == ("a.jpg", None, 3)
     with pytest.raises(UsageError, match=r"must end in .csv or .parquet \(got"):
         write_summary(tmp_path / "s.xls", summaries, Limits())
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(UsageError, match="cannot be written"):
         write_summary(tmp_path / "none" / path.name, summaries, Limits())
 
 

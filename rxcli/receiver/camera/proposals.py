@@ -72,7 +72,8 @@ def propose(
     bends = [np.zeros(4)] + ([likeliest_bend(coarse, level)] if may_bend else [])
     found = [clock for bend in bends for clock in _clocks(coarse, level, bend, width, exposures)]
     if max(exposures.values()) > SETTINGS.long_exposure_slots or not exposure_s:
-        found += _smeared_clocks(strips, exposures, may_bend=may_bend)
+        stripes = _half_width(_autocorrelation(level.reshape(strips.n_columns, -1, level.shape[1]).mean(axis=1)))
+        found += _smeared_clocks(strips, exposures, stripes * coarse.pitch / strips.pitch, may_bend=may_bend)
     distinct: list[CameraHypothesis] = []
     for hypothesis in sorted(found, key=lambda clock: -clock.score):
         if len(distinct) < SETTINGS.n_proposed and not any(_is_same(hypothesis, better) for better in distinct):
@@ -166,9 +167,21 @@ def _clocks(
                 )
 
 
-def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_bend: bool) -> Iterator[CameraHypothesis]:
-    """Clocks of light that is exposed for several slots: its changes over one slot are as sharp as a short exposure."""
+def _smeared_clocks(
+    strips: ColumnStrips, exposures: dict[int, float], half_width: float, *, may_bend: bool
+) -> Iterator[CameraHypothesis]:
+    """Clocks of light that is exposed for several slots: its changes over one slot are as sharp as a short exposure.
+
+    Args:
+        strips: of the picture.
+        exposures: stated exposure in slots by packet length, 0 for none.
+        half_width: of the light's autocorrelation, rows; texture widens it, so that it limits the exposure.
+        may_bend: whether the camera may have taken a distortion out.
+    """
     for rows, strength in slot_lines(strips):
+        longest = exposure_of(half_width / rows, rows * strips.pitch)
+        if longest < SETTINGS.long_exposure_slots and not any(exposures.values()):
+            continue
         change = changes_over(strips, rows)
         bends = [np.zeros(4)] + ([likeliest_bend(strips, change)] if may_bend else [])
         for bend in bends:
@@ -187,7 +200,7 @@ def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_be
                         reversed=bool(is_reversed),
                         curvature=bend,
                         exposure_slots=exposure
-                        or _exposure_by_echo(total, rows, length, is_reversed=bool(is_reversed)),
+                        or min(longest, _exposure_by_echo(total, rows, length, is_reversed=bool(is_reversed))),
                         score=max(header, 0.0) ** 2 + common,
                         rows_per_slot_sd=rows * rows * strips.pitch / (4 * columns.shape[1]),
                         curvature_sd=np.abs(bend) / 4,

@@ -235,7 +235,7 @@ def _receive_anew(
         return Lost(known), acquired, None
     options, acquisition = camera.options, acquired.acquisition
     with timer("detect"):
-        reception = decode(acquisition, options.skip, acquired.initial)
+        reception = decode(acquisition, options.skip, acquired.initial, adds_up=True)
     with timer("denoise"):
         reception, denoised, report = apply_autoencoder(acquisition, reception, options)
     if ledger.start is None and shows_steady_light(reception):

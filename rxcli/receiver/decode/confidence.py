@@ -19,6 +19,8 @@ from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, In
 
 #: Lower limit of the log-likelihood of slots against a packet, so that its logarithm exists.
 _MIN_CONTRADICTION = 0.5
+#: Number of the first feature of joint detections, which is 1 for them and 0 for others.
+_FIRST_JOINT = 8
 #: Tolerance when features are compared.
 _FEATURE_TOLERANCE = 1e-4
 #: Upper limit of the negative log probability of a packet, so that its log-odds are finite.
@@ -94,7 +96,12 @@ class Quality:
 
 def still_quality(posteriors: BurstPosteriors, confidence_features: FloatArray) -> Quality:
     """Confidence of the packets of a photograph."""
-    return Quality(confidence(confidence_features), _share_unsure(posteriors), confidence_features)
+    log_odds, share = confidence_log_odds(confidence_features), _share_unsure(posteriors)
+    n_bits = np.maximum((~np.isnan(posteriors.bit_llr)).sum(axis=(-2, -1)), 1)
+    # The likelihoods of a joint detection are too sure of single bits as well.
+    is_joint = confidence_features[..., _FIRST_JOINT] > 0
+    share = np.where(is_joint, np.maximum(share, wrong_share(log_odds, n_bits)), share)
+    return Quality(_probability(log_odds), share, confidence_features)
 
 
 def _share_unsure(posteriors: BurstPosteriors) -> FloatArray:

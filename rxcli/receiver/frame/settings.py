@@ -28,6 +28,8 @@ class StillSettings:
 
     #: Samples per slot of the first passes.
     coarse_samples: int = 2
+    #: Fewest rows per slot of a joint detection.
+    min_joint_rows: float = 2.0
     #: Black level of a long exposure, as a share of a percentile of the light.
     dark_share: float = 0.95
     dark_percent: float = 0.5
@@ -40,6 +42,8 @@ class StillSettings:
     max_column_gain: float = 40.0
     #: Least log probability of a weight by the initial pass that the joint detection starts from.
     min_weight_log_prior: float = -3.0
+    #: Minimum confidence of a packet that the auto-encoder corrected.
+    min_corrected_confidence: float = 0.1
     #: Confidence of a packet below which its column gets further passes.
     doubtful: float = 0.985
     #: Limit of strip slots for the network, which takes most of the time; the least certain columns are left out.
