@@ -260,7 +260,8 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
         spectrum = (power / (power.mean(axis=1, keepdims=True) + TINY)).sum(axis=0)
         spectrum /= _blurred(spectrum[None].astype(np.float32), SETTINGS.line_bins)[0] + np.float32(TINY)
         frequency = np.arange(spectrum.size) / (_FINE * n)
-        mosaic = np.abs(frequency - 0.25) < SETTINGS.mosaic_line
+        # The mosaic shows as periods of two and of four rows.
+        mosaic = np.minimum(np.abs(frequency - 0.25), np.abs(frequency - 0.5)) < SETTINGS.mosaic_line
         inside = (frequency > 1 / (7 * lag)) & (frequency < 1 / (1.6 * lag)) & ~mosaic
         peaks = _peaks(np.where(inside, spectrum, 0.0), SETTINGS.n_peaks, 2 * _FINE)
         found += [(float(spectrum[round(peak)]), _FINE * n / peak) for peak in peaks.tolist() if peak > 0]

@@ -61,7 +61,7 @@ class EstimateSettings:
     min_light: float = 1e-4
     #: Bins around a line that it is compared with; distance of the mosaic's line, cycles a row.
     line_bins: int = 801
-    mosaic_line: float = 2e-3
+    mosaic_line: float = 5e-3
     #: Slots over which the picture is taken as constant.
     picture_slots: float = 25.0
     #: Fits at most, and slots by which a fit moves the clock, anywhere, from which on a frame with plain packets is
