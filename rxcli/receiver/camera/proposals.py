@@ -71,14 +71,23 @@ def propose(
     level *= weight
     bends = [np.zeros(4)] + ([likeliest_bend(coarse, level)] if may_bend else [])
     found = [clock for bend in bends for clock in _clocks(coarse, level, bend, width, exposures)]
+    smeared: list[CameraHypothesis] = []
     if max(exposures.values()) > SETTINGS.long_exposure_slots or not exposure_s:
         stripes = _half_width(_autocorrelation(level.reshape(strips.n_columns, -1, level.shape[1]).mean(axis=1)))
-        found += _smeared_clocks(strips, exposures, stripes * coarse.pitch / strips.pitch, may_bend=may_bend)
-    distinct: list[CameraHypothesis] = []
+        smeared += _smeared_clocks(strips, exposures, stripes * coarse.pitch / strips.pitch, may_bend=may_bend)
+    if exposure_s:
+        return _distinct([], found + smeared)
+    # Where no exposure is stated, short ones come first.
+    return _distinct(_distinct([], found), smeared)
+
+
+def _distinct(first: list[CameraHypothesis], found: list[CameraHypothesis]) -> list[CameraHypothesis]:
+    """`first`, and the best few of the others that differ, numbered."""
+    out, most = list(first), len(first) + SETTINGS.n_proposed
     for hypothesis in sorted(found, key=lambda clock: -clock.score):
-        if len(distinct) < SETTINGS.n_proposed and not any(_is_same(hypothesis, better) for better in distinct):
-            distinct.append(replace(hypothesis, number=len(distinct)))
-    return distinct
+        if len(out) < most and not any(_is_same(hypothesis, better) for better in out):
+            out.append(replace(hypothesis, number=len(out)))
+    return out
 
 
 def stripe_rows(strips: ColumnStrips) -> float:

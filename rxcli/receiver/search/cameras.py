@@ -71,7 +71,7 @@ def propose_cameras(
     screens = sorted(options.screens, key=lambda screen: -screen.slot_rate_hz)
     with timer("blind"):
         hypotheses = propose(strips, screens, frame.metadata.exposure_s, may_bend=frame.mosaic is None)
-    for hypothesis in sorted(hypotheses, key=lambda h: (-h.score, h.rows_per_slot, h.reversed)):
+    for hypothesis in sorted(hypotheses, key=lambda h: h.number):
         screen = next(s for s in screens if s.packet_slots == hypothesis.packet_slots)
         yield estimated_camera(hypothesis, screen.slot_rate_hz, frame)
     return Failure("no_signal", why_not(strips))
