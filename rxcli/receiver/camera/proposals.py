@@ -151,6 +151,7 @@ def _clocks(
     harmonics = _FINE * np.array([1, 2])
     copies = _surprise(correlation, round(2 * SLOTS_PER_SYMBOL * shortest))
     total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
+    limit = SETTINGS.long_exposure_slots
     for length, exposure in exposures.items():
         first, last = (int(rows * length) for rows in (shortest, longest))
         lags = first + _peaks(copies[first : last + 1], SETTINGS.n_peaks, max(round(2 * shortest), 1))
@@ -167,7 +168,7 @@ def _clocks(
                     packet_slots=length,
                     reversed=bool(is_reversed),
                     curvature=bend,
-                    exposure_slots=exposure or exposure_of(half_width / rows, rows * pitch),
+                    exposure_slots=exposure or min(exposure_of(half_width / rows, rows * pitch), limit),
                     score=max(header, 0.0) ** 2 + common,
                     # A period that is off by a quarter of a slot over the picture shows as well.
                     rows_per_slot_sd=rows * rows * pitch / (4 * n_rows),
