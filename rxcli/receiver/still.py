@@ -116,9 +116,9 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
 
     single = replace(clock, burst=np.arange(clock.n_copies))
     alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
-    metrics = channel.metrics_of(_llr_of(single.on_grid(alone.lit)), model.exposure.isi_memory)
     lit = single.on_grid(alone.lit)
-    clock = sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)[0][0]
+    metrics = channel.metrics_of(_llr_of(lit), model.exposure.isi_memory)
+    clock = _in_bursts(acquisition, clock, metrics)
     bursts = of_bursts(clock, lit)
     posteriors = survivors.detect(bursts, QUICK_SURVIVORS)
     free = survivors.free_log_evidence(bursts, QUICK_SURVIVORS)

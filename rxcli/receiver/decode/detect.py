@@ -63,11 +63,11 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
         if not likeliest.any():
             continue
         columns, w, posterior = trellis.columns[likeliest], trellis.w, trellis.word_posteriors(likeliest)
-        lit[:, columns, :PREAMBLE_SLOTS] = _preamble(w)
+        lit[:, columns, :PREAMBLE_SLOTS] = preamble_slots(w)
         lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(w)).reshape(n_bursts, columns.size, -1)
         index[:, columns] = best = posterior.argmax(axis=-1)
-        log_prob[:, columns] = _log_of_best(posterior, best)
-        bit_llr[:, columns, :, : bits_per_symbol(w)] = _bit_llr(posterior, bits_per_symbol(w))
+        log_prob[:, columns] = log_of_best(posterior, best)
+        bit_llr[:, columns, :, : bits_per_symbol(w)] = llr_of_bits(posterior, bits_per_symbol(w))
     log_evidence = np.logaddexp.reduce(w_log_evidence, axis=1)
     weights, w_log_prob = w_log_evidence.argmax(axis=1) + 1, w_log_evidence - log_evidence[:, None]
     return BurstPosteriors(weights, w_log_prob, log_evidence, lit, index, log_prob, bit_llr, _header_llr(metrics))
@@ -77,19 +77,19 @@ def _isi_memory_of(metrics: FloatArray) -> int:
     return int(metrics.shape[-1]).bit_length() - 2
 
 
-def _preamble(w: int) -> NDArray[np.uint8]:
+def preamble_slots(w: int) -> NDArray[np.uint8]:
     """(20,) slots of header and dimming symbol."""
     return np.concatenate([np.array(HEADER, np.uint8), dimming_symbol(w)])
 
 
-def _log_of_best(posterior: FloatArray, best: NDArray[np.int64]) -> FloatArray:
+def log_of_best(posterior: FloatArray, best: NDArray[np.int64]) -> FloatArray:
     """Log of the largest probability, computed from the sum of the others to resolve 1 - 1e-12 from 1."""
     rest = posterior.copy()
     np.put_along_axis(rest, best[..., None], 0.0, -1)
     return np.asarray(np.log1p(-np.minimum(rest.sum(axis=-1), 1 - 1 / posterior.shape[-1])))
 
 
-def _bit_llr(posterior: FloatArray, k: int) -> FloatArray:
+def llr_of_bits(posterior: FloatArray, k: int) -> FloatArray:
     """(..., k) ln p(1)/p(0) from (..., 2**k) probabilities of the codebook indices."""
     bits = _states(k)
     p_one, p_zero = posterior @ bits, posterior @ (1 - bits)
@@ -140,7 +140,7 @@ def _branches(w: int, isi_memory: int) -> _Branches:
     index = _pattern_index(words, isi_memory)
     ends = words[:, :isi_memory], words[:, -isi_memory:]
     prefix, suffix = (_pattern_index(end, isi_memory - 1)[:, 0] for end in ends)
-    preamble = _preamble(w)
+    preamble = preamble_slots(w)
     header = np.broadcast_to(np.array(HEADER[:isi_memory]), states.shape)
     return _Branches(
         features=(index[..., None] == np.arange(2 * n_states)).reshape(len(words), -1).T.astype(np.float64, order="C"),

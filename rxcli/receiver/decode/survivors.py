@@ -29,6 +29,7 @@ from rxcli.protocol import (
     dimming_symbol,
     slot_patterns,
 )
+from rxcli.receiver.decode.detect import llr_of_bits, log_of_best, preamble_slots
 from rxcli.receiver.decode.settings import SURVIVORS, SurvivorSettings
 from rxcli.receiver.light import exposed_from
 from rxcli.types import BurstPosteriors, BurstSamples, Float32Array, FloatArray, IntArray
@@ -76,11 +77,9 @@ def detect(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> Bur
     """Posteriors of bursts from their samples; `header_llr` is 0."""
     n_bursts, n_columns = samples.n_bursts, samples.n_columns
     paths, steps, ends = _forward(samples, settings, is_free=False)
-    log_evidence = np.logaddexp.reduce(paths.log_likelihood, axis=1) + samples.log_scale * settings.information
     words = _backward(steps, ends, np.zeros_like(paths.log_likelihood))
     # One weight for all bursts of a column.
-    by_weight = [_weight_log_prob(*word) for word in words[:1]]
-    w_log_prob = by_weight[0].reshape(n_bursts, n_columns, -1).sum(axis=0) if by_weight else np.zeros((n_columns, 9))
+    w_log_prob = _weight_log_prob(*words[0]).reshape(n_bursts, n_columns, -1).sum(axis=0)
     w_log_prob = w_log_prob - np.logaddexp.reduce(w_log_prob, axis=1, keepdims=True)
     w = w_log_prob.argmax(axis=1) + 1
     shape = (n_bursts, n_columns, len(words))
@@ -90,16 +89,13 @@ def detect(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> Bur
     for weight in np.unique(w).tolist():
         columns = np.flatnonzero(w == weight)
         posterior = _word_posteriors(words, weight, (n_bursts, n_columns))[:, columns]
-        lit[:, columns, :PREAMBLE_SLOTS] = np.concatenate([HEADER, dimming_symbol(weight)])
+        lit[:, columns, :PREAMBLE_SLOTS] = preamble_slots(weight)
         lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(weight)).reshape(n_bursts, columns.size, -1)
         index[:, columns] = best = posterior.argmax(axis=-1)
-        rest = posterior.copy()
-        np.put_along_axis(rest, best[..., None], 0.0, -1)
-        log_prob[:, columns] = np.log1p(-np.minimum(rest.sum(axis=-1), 1 - 1 / posterior.shape[-1]))
-        bits = slot_patterns(bits_per_symbol(weight) - 1)
-        p_one, p_zero = posterior @ bits, posterior @ (1 - bits)
-        bit_llr[:, columns, :, : bits.shape[1]] = np.log(np.maximum(p_one, TINY)) - np.log(np.maximum(p_zero, TINY))
-    evidence = log_evidence.reshape(n_bursts, n_columns).sum(axis=0)
+        log_prob[:, columns] = log_of_best(posterior, best)
+        n_bits = bits_per_symbol(weight)
+        bit_llr[:, columns, :, :n_bits] = llr_of_bits(posterior, n_bits)
+    evidence = _log_evidence(paths, samples, settings).reshape(n_bursts, n_columns).sum(axis=0)
     header_llr = np.zeros((n_bursts, n_columns))
     return BurstPosteriors(w, w_log_prob, evidence, lit, index, log_prob, bit_llr, header_llr)
 
@@ -107,7 +103,7 @@ def detect(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> Bur
 def lane_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> FloatArray:
     """(lanes,) log evidence of packets in each burst and column; see `BurstPosteriors.log_evidence`."""
     paths, _, _ = _forward(samples, settings, is_free=False)
-    return np.asarray(np.logaddexp.reduce(paths.log_likelihood, axis=1) + samples.log_scale * settings.information)
+    return _log_evidence(paths, samples, settings)
 
 
 def side_by_side(parts: Sequence[BurstSamples]) -> BurstSamples:
@@ -125,8 +121,13 @@ def side_by_side(parts: Sequence[BurstSamples]) -> BurstSamples:
 def free_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> FloatArray:
     """(C,) log evidence of arbitrary slots, all bursts together; see `BurstPosteriors.log_evidence`."""
     paths, _, _ = _forward(samples, settings, is_free=True)
-    log_evidence = np.logaddexp.reduce(paths.log_likelihood, axis=1) + samples.log_scale * settings.information
+    log_evidence = _log_evidence(paths, samples, settings)
     return np.asarray(log_evidence.reshape(samples.n_bursts, samples.n_columns).sum(axis=0))
+
+
+def _log_evidence(paths: _Paths, samples: BurstSamples, settings: SurvivorSettings) -> FloatArray:
+    """(lanes,) log evidence of the last paths together."""
+    return np.asarray(np.logaddexp.reduce(paths.log_likelihood, axis=1) + samples.log_scale * settings.information)
 
 
 def _forward(
