@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import re
@@ -13,8 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
-
-import msgspec
 
 from rxcli import __version__, outputs
 from rxcli.cli.common import claim_outputs, receiver_options, refuse
@@ -29,7 +26,6 @@ from rxcli.results.baseline import load_baseline
 from rxcli.results.truth import Scorer, load_truth, truth_for
 from rxcli.runs import batch
 from rxcli.runs.journal import Head, Journal, Lines
-from rxcli.runs.provenance import settings_in_force
 from rxcli.types import BELIEVABLE, FrameResult
 
 log = logging.getLogger(__name__)
@@ -171,14 +167,14 @@ class _Run:
             def journal(path: str | Path, resume: bool = False) -> Journal:
                 return stack.enter_context(closing(Journal(Path(path), resume)))
 
-            lines = Lines(self._head(), {name: path for name, path in self._paths.items() if name != STDIN})
             output = None if path in (None, "-") else journal(path, resume)
             if self._given["payloads"] is not None:
                 self._payloads = PayloadTable(journal(self._given["payloads"]).append)
-            if output is not None and resume:
-                done = self._recover(output, lines)
-            lines.begun = bool(done)
             if path is not None:
+                lines = Lines(self._head(), {name: path for name, path in self._paths.items() if name != STDIN})
+                if output is not None and resume:
+                    done = self._recover(output, lines)
+                lines.begun = bool(done)
                 self._output = JsonLines(lines, print_line if output is None else output.append)
             elif not self._given["quiet"]:
                 self._output = Table(self._given["packets"])
@@ -195,6 +191,12 @@ class _Run:
 
     def _head(self) -> Head:
         """What the results depend on: the version, the options, what the profiles hold, the thresholds in force."""
+        import hashlib  # loads OpenSSL, and the thresholds load every room of the receiver: only --json needs them
+
+        import msgspec
+
+        from rxcli.runs.provenance import settings_in_force
+
         given = {name: value for name, value in self._given.items() if name not in _NO_MATTER}
         configured = self._decoder.options
         profiles = msgspec.json.encode((configured.screens, configured.cameras))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import struct
 import unicodedata
 import zlib
@@ -147,7 +146,13 @@ def pack_container(name: str, data: bytes) -> bytes:
     compressor = zlib.compressobj(9, zlib.DEFLATED, -15)
     deflated = compressor.compress(data) + compressor.flush()
     flags, body = (_DEFLATED, deflated) if len(deflated) < len(data) else (0, data)
-    return pack_parts(encoded, len(data), hashlib.sha256(data).digest(), flags, body)
+    return pack_parts(encoded, len(data), _sha256(data), flags, body)
+
+
+def _sha256(data: bytes) -> bytes:
+    import hashlib  # loads OpenSSL, which pictures without a whole file do without
+
+    return hashlib.sha256(data).digest()
 
 
 def pack_parts(name: bytes, length: int, digest: bytes, flags: int, body: bytes) -> bytes:
@@ -195,7 +200,7 @@ def unpack_container(container: bytes, max_bytes: int) -> Container:
     if len(data) != length:
         relation = "more" if len(data) > length else "fewer"
         raise ContainerError(f"the file has {relation} bytes than its stated length of {length}")
-    found = hashlib.sha256(data).digest()
+    found = _sha256(data)
     if found != digest:
         raise ContainerError("the file's SHA-256 does not fit")
     name = container[_CONTAINER_HEAD.size : at].decode("utf-8", "replace")

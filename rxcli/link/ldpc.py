@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +74,7 @@ class Code:
 
 @cache
 def _base_graph(graph: int) -> NDArray[np.int64]:
-    text = files("rxcli.link").joinpath(f"nr_base_graph_{graph}.csv").read_text(encoding="ascii")
+    text = Path(__file__).with_name(f"nr_base_graph_{graph}.csv").read_text(encoding="ascii")
     return np.array([[int(v) for v in line.split(",")] for line in text.split()[1:]], np.int64)
 
 

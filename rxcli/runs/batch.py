@@ -6,12 +6,10 @@ Results come source by source in the order of the input in either case; `rxcli.r
 from __future__ import annotations
 
 import logging
-import logging.handlers
 import os
 import signal
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -322,6 +320,8 @@ class _Pool:
     """Threads that each have a worker process, give it one source after the other, and queue its results."""
 
     def __init__(self, decoder: Decoder, n_workers: int) -> None:
+        from concurrent.futures import ThreadPoolExecutor
+
         self._decoder, self._n_workers = decoder, n_workers
         self._threads = ThreadPoolExecutor(n_workers)
         #: One for each worker; a thread that takes them all decodes alone.
@@ -428,6 +428,8 @@ def _ending(exitcode: int | None) -> str:
 
 def _work(connection: Connection, decoder: Decoder, level: int) -> None:
     """Worker loop: receive a source, send its results and a None, until the connection closes."""
+    import logging.handlers
+
     for number in _FIRST_DECIDES:
         signal.signal(number, signal.SIG_IGN)
     _hold_signals(signal.SIG_UNBLOCK)
