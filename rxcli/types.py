@@ -536,6 +536,16 @@ class FrameResult:
         """Packets of all columns."""
         return tuple(packet for column in self.columns for packet in column.packets)
 
+    @property
+    def numbering_remark(self) -> str:
+        """What the numbers of the columns are worth if the picture leaves them open."""
+        leftmost = next((column.column for column in self.columns if column.packets), 0)
+        return (
+            f"columns numbered from the leftmost that was seen: it is the screen's column {leftmost} with a "
+            f"probability of {self.column_certainty:.2f}; take one side of the screen into view to have the screen's "
+            "numbers"
+        )
+
     def with_columns_mirrored(self) -> FrameResult:
         """Count columns, corners and soft bits from the opposite side."""
         soft = self.soft_bits

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import product
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 from rxcli.link import ldpc
 from rxcli.link.formats import unprotect_beacon
 from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
+from rxcli.link.placement import Placement, possible_placements
 from rxcli.link.softbits import Float32, information, log_likelihood, same_bits_llr, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
@@ -39,10 +42,11 @@ class _Round:
     #: Sum of `surprise` of everything that was added.
     alone: float
     epoch: int
-    #: Position of burst number 0 of the epoch.
-    phase: int
-    #: Information at the last attempt for (length, phase).
-    tried: dict[tuple[int, int], float] = field(default_factory=dict)
+    #: Position of burst number 0 of the epoch, and how the epoch's columns are placed in the sums.
+    phase: int = 0
+    placement: Placement = field(default_factory=Placement)
+    #: Information at the last attempt for (length, phase, group of placements).
+    tried: dict[tuple[int, int, int], float] = field(default_factory=dict)
     #: The decoded message.
     found: tuple[MessageKind, bytes] | None = None
 
@@ -50,19 +54,25 @@ class _Round:
         """Log-likelihood ratio of all bursts carrying one message."""
         return float(self.levels.sum()) - self.alone
 
-    def gain(self, frame: _FrameSum, phase: int) -> float:
-        """Gain in similarity from a frame, if its burst number 0 has position `place`."""
+    def gain(self, frame: _FrameSum, phase: int, placement: Placement) -> float:
+        """Gain in similarity from a frame, if its burst number 0 has position `phase` and its columns are placed so."""
         slots = (frame.slots + phase) % len(self.total)
-        joined = self.total[slots] + frame.total
+        joined = self.total[slots] + placement.of(frame.total)
         return float(surprise(joined).sum(dtype=np.float64) - self.levels[slots].sum()) - frame.alone
 
-    def add(self, frame: _FrameSum, phase: int, epoch: int) -> None:
+    def add(self, frame: _FrameSum, phase: int, placement: Placement, epoch: int) -> None:
         """Add a frame."""
         slots = (frame.slots + phase) % len(self.total)
-        self.total[slots] += frame.total
+        self.total[slots] += placement.of(frame.total)
         self.levels[slots] = _levels(self.total[slots])
         self.alone += frame.alone
-        self.epoch, self.phase = epoch, phase
+        self.epoch, self.phase, self.placement = epoch, phase, placement
+
+    def settle(self, found: tuple[MessageKind, bytes], placement: Placement) -> None:
+        """Place the sums as the decoded message shows."""
+        self.found, self.placement = found, placement.after(self.placement)
+        self.total = placement.of(self.total).copy()
+        self.levels = _levels(self.total)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,51 +122,70 @@ class BeaconSearch:
         self._fruitless = dict.fromkeys(self._layouts, 0)
         self._waited = dict.fromkeys(self._layouts, 0)
 
-    def add(self, soft: FrameSoftBits) -> list[tuple[MessageKind, bytes]]:
-        """Add bursts and return the messages found with them, known ones included."""
+    def add(self, soft: FrameSoftBits, settled: Placement | None) -> list[tuple[tuple[MessageKind, bytes], Placement]]:
+        """Add bursts and return the messages found with them, known ones included, with the placement of the columns.
+
+        Args:
+            soft: the bursts.
+            settled: placement of their columns, None while it is open.
+        """
         found = []
         for period in self._layouts:
-            candidate = self._joined(period, soft)
+            candidate = self._joined(period, soft, settled)
             if candidate is not None:
-                self._try(candidate)
+                self._try(candidate, settled)
                 if candidate.found is not None:
-                    found.append(candidate.found)
+                    found.append((candidate.found, candidate.placement))
         return found
 
-    def _joined(self, period: int, soft: FrameSoftBits) -> _Round | None:
+    def _joined(self, period: int, soft: FrameSoftBits, settled: Placement | None) -> _Round | None:
         """Add the bursts to their round or to a new one; None if they contradict each other."""
         frame = _frame_sum(soft, period)
         if frame.similarity() < _MIN_SIMILARITY:
             return None
-        rounds = self._rounds[period]
+        rounds, as_numbered = self._rounds[period], settled or Placement()
         choices = [
-            (known.gain(frame, phase), place, phase)
+            (known.gain(frame, phase, placement), place, phase, placement)
             for place, known in enumerate(rounds)
-            for phase in ((known.phase,) if known.epoch == soft.epoch else range(period))
+            for phase, placement in (
+                ((known.phase, known.placement),)
+                if known.epoch == soft.epoch
+                else product(range(period), (as_numbered,))
+            )
         ]
-        gain, place, phase = max(choices, default=(-np.inf, 0, 0))
+        if max((gain for gain, *_ in choices), default=np.inf) < _COPIES and settled is None:
+            # Photographs may be numbered otherwise; that they carry the same message must then be certain.
+            elsewhere = [placement for group in possible_placements(frame.total)[1:] for placement in group]
+            choices += [
+                (known.gain(frame, phase, placement) + _MIN_SIMILARITY - _COPIES, place, phase, placement)
+                for place, known in enumerate(rounds)
+                if known.epoch != soft.epoch
+                for phase, placement in product(range(period), elsewhere)
+            ]
+        gain, place, phase, placement = max(choices, key=itemgetter(0), default=(-np.inf, 0, 0, as_numbered))
         if gain > _MIN_SIMILARITY:
             candidate = rounds.pop(place)
         else:
             blank = np.zeros((period, *self._shape), np.float32)
-            candidate, phase = _Round(blank, np.zeros(period), 0.0, soft.epoch, 0), 0
-        candidate.add(frame, phase, soft.epoch)
+            candidate, phase, placement = _Round(blank, np.zeros(period), 0.0, soft.epoch), 0, as_numbered
+        candidate.add(frame, phase, placement, soft.epoch)
         rounds.append(candidate)
         del rounds[:-_MAX_ROUNDS]
         return candidate
 
-    def _try(self, candidate: _Round) -> None:
+    def _try(self, candidate: _Round, settled: Placement | None) -> None:
         if candidate.found is not None or not self._worth_while(candidate):
             return
-        n_observed = np.count_nonzero(candidate.total)
-        for layout in self._layouts[len(candidate.total)]:
-            if n_observed < _TRY_FROM * layout.code.k:
-                continue
-            for phase in range(len(candidate.total)):
-                candidate.found = self._tried(candidate, layout, phase)
-                if candidate.found is not None:
-                    self._fruitless[len(candidate.total)] = 0
-                    return
+        n_observed, period = np.count_nonzero(candidate.total), len(candidate.total)
+        groups = possible_placements(candidate.total)
+        if settled is not None:
+            groups = [[settled.after(candidate.placement.inverse)]]
+        layouts = [layout for layout in self._layouts[period] if n_observed >= _TRY_FROM * layout.code.k]
+        for number, layout, phase in product(range(len(groups)), layouts, range(period)):
+            for placement, found in self._tried(candidate, layout, phase, number, groups[number]):
+                candidate.settle(found, placement)
+                self._fruitless[period] = 0
+                return
 
     def _worth_while(self, candidate: _Round) -> bool:
         """Whether to attempt decoding: the bursts of most clips are no beacons and not similar."""
@@ -168,18 +197,27 @@ class BeaconSearch:
         self._waited[len(candidate.total)] = 0
         return True
 
-    def _tried(self, candidate: _Round, layout: BeaconLayout, phase: int) -> tuple[MessageKind, bytes] | None:
-        buffer = gathered(layout, np.roll(candidate.total, phase, axis=0))
-        bits = float(information(buffer).sum()) / layout.code.k
-        last = candidate.tried.get((layout.length, phase), _TRY_FROM - _RETRY_GAIN)
-        if bits < min(last + _RETRY_GAIN, _TRY_UP_TO) or last >= _TRY_UP_TO:
-            return None
-        if same_bits_llr(buffer, float(candidate.levels.sum())) < _MIN_SIMILARITY:
-            return None
-        candidate.tried[layout.length, phase] = bits
+    def _tried(
+        self, candidate: _Round, layout: BeaconLayout, phase: int, group: int, placements: Sequence[Placement]
+    ) -> Iterator[tuple[Placement, tuple[MessageKind, bytes]]]:
+        """Decode a candidate under a group of placements, and yield each one that gives a message."""
+        total, key = np.roll(candidate.total, phase, axis=0), (layout.length, phase, group)
+        last = candidate.tried.get(key, _TRY_FROM - _RETRY_GAIN)
+        if last >= _TRY_UP_TO:
+            return
+        buffers = np.stack([gathered(layout, placement.of(total)) for placement in placements])
+        bits = information(buffers).sum(axis=1) / layout.code.k
+        alone = float(candidate.levels.sum())
+        possible = np.array([same_bits_llr(buffer, alone) >= _MIN_SIMILARITY for buffer in buffers])
+        which = np.flatnonzero(possible & (bits >= min(last + _RETRY_GAIN, _TRY_UP_TO)))
+        if which.size == 0:
+            return
+        candidate.tried[key] = float(bits[which].max())
         self._fruitless[len(candidate.total)] += 1
-        words = read_words(layout, buffer[None])
-        return None if words[0] is None else unprotect_beacon(words[0])
+        for place, word in zip(which.tolist(), read_words(layout, buffers[which]), strict=True):
+            found = None if word is None else unprotect_beacon(word)
+            if found is not None:
+                yield placements[place], found
 
 
 def gathered(layout: BeaconLayout, llr: Float32) -> Float32:

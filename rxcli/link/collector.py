@@ -6,16 +6,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rxcli.link.files import FilesUnderWay
+from rxcli.link.placement import Placement, placed
 from rxcli.link.receiver import LinkReceiver
 from rxcli.link.softbits import Event
 from rxcli.profiles import ScreenProfile
-from rxcli.types import FILE_MEMORY_MB, FrameResult, FrameSoftBits, Message, ObjectProgress, ReceivedObject
+from rxcli.types import FILE_MEMORY_MB, FrameResult, Message, ObjectProgress, ReceivedObject
 
 
 class Collector:
     """Link layer of one source, or of several photos of one transmission.
 
-    Columns are tried in both directions until one gives a text or announces a file, since a picture may be mirrored.
+    What decodes shows how the picture's columns lie on the screen: mirrored, or numbered some columns off.
 
     Args:
         screens: profiles that results may name.
@@ -25,54 +26,37 @@ class Collector:
     def __init__(self, screens: Sequence[ScreenProfile], file_memory_mb: int = FILE_MEMORY_MB) -> None:
         self._under_way = FilesUnderWay(file_memory_mb)
         self._shapes = {screen.name: (screen.columns, screen.payload_symbols) for screen in screens}
-        #: Receivers by columns, payload symbols, and whether columns are counted from the opposite side.
-        self._receivers: dict[tuple[int, int, bool], LinkReceiver] = {}
-        #: Whether columns are counted from the opposite side; None until a message or file decides.
-        self._turned: bool | None = None
+        #: Receivers by columns and payload symbols.
+        self._receivers: dict[tuple[int, int], LinkReceiver] = {}
+        #: Placement of the source's columns; None until a message or file decides.
+        self._placement: Placement | None = None
         self._source = ""
 
     def add(self, result: FrameResult) -> FrameResult:
-        """Replace the soft bits of a result by the messages and files that they complete; mirror it if necessary."""
+        """Replace the soft bits of a result by what they complete, and number its columns as that shows."""
         soft, result = result.soft_bits, replace(result, soft_bits=None)
         if result.source != self._source:  # the next photo may come from a different camera
-            self._source, self._turned = result.source, None
-        events: list[Event] = []
-        if soft is not None:
-            for turned in (False, True) if self._turned is None else (self._turned,):
-                events = self._add_bits(soft, result.screen_profile, turned)
-                if self._turned is not None:
-                    break
-        if self._turned is not None:
-            result = result.with_columns_mirrored() if self._turned else replace(result, mirrored=bool(result.mirrored))
-        return with_events(result, events)
-
-    def _add_bits(self, soft: FrameSoftBits, screen_profile: str | None, turned: bool) -> list[Event]:
-        """Add the soft bits of a screen with columns counted from one side; return completed messages and files."""
-        shape = self._shapes.get(screen_profile or "")
-        if shape is None or soft.llr.shape[1:3] != shape[::-1]:
-            return []
-        if (*shape, turned) not in self._receivers:
-            self._receivers[*shape, turned] = LinkReceiver(*shape, self._under_way)
-        receiver = self._receivers[*shape, turned]
-        events = receiver.add(replace(soft, llr=soft.llr[:, :, ::-1]) if turned else soft)
-        if self._turned is None and (events or receiver.progress):
-            self._turned = turned
-        return events
+            self._source, self._placement = result.source, None
+        shape, events = self._shapes.get(result.screen_profile or ""), list[Event]()
+        if soft is not None and shape is not None and soft.llr.shape[1:3] == shape[::-1]:
+            if shape not in self._receivers:
+                self._receivers[shape] = LinkReceiver(*shape, self._under_way)
+            receiver = self._receivers[shape]
+            receiver.placement = self._placement
+            events = receiver.add(soft)
+            self._placement = receiver.placement
+        return with_events(result if self._placement is None else placed(result, self._placement), events)
 
     def finish(self, last: FrameResult) -> FrameResult:
         """Add the remaining messages and files, complete or not, to the last result of the source."""
-        events = [event for receiver in self._decided for event in receiver.finish()]
-        notes = dict.fromkeys(sentence for receiver in self._decided for sentence in receiver.notes)
+        events = [event for receiver in self._receivers.values() for event in receiver.finish()]
+        notes = dict.fromkeys(sentence for receiver in self._receivers.values() for sentence in receiver.notes)
         return replace(with_events(last, events), progress=tuple(self.progress), link_notes=tuple(notes))
-
-    @property
-    def _decided(self) -> list[LinkReceiver]:
-        return [receiver for (*_, turned), receiver in self._receivers.items() if turned == bool(self._turned)]
 
     @property
     def progress(self) -> list[ObjectProgress]:
         """Progress of incomplete files."""
-        return [progress for receiver in self._decided for progress in receiver.progress]
+        return [progress for receiver in self._receivers.values() for progress in receiver.progress]
 
 
 class PhotoCollector(Collector):

@@ -20,6 +20,7 @@ from rxcli.link.formats import (
     unprotect_announcement,
 )
 from rxcli.link.layout import ANNOUNCEMENT_PERIOD, CRC_BYTES, LABEL_BITS, FileLayout, announcement_layout
+from rxcli.link.placement import Placement, possible_placements
 from rxcli.link.sequences import whiten
 from rxcli.link.softbits import INFORMATION_OF_STEPS, Float32, information, log_likelihood, same_bits_llr, surprise
 from rxcli.types import FILE_MEMORY_MB, FrameSoftBits, ObjectProgress
@@ -29,6 +30,8 @@ _LN2 = float(np.log(2.0))
 _TRY_ANNOUNCEMENT, _MIN_SIMILARITY = 1.02, -8.0
 #: Batch size for announcements whose copies do not decide.
 _ANNOUNCEMENTS_AT_ONCE = 32
+#: Bursts in which announcements are tried under shifted column numbers.
+_MAX_SHIFTED = 96
 #: Blocks per batch, the share of the remaining blocks that suffices, and frames after which fewer suffice.
 _BLOCKS_AT_ONCE, _SHARE_AT_ONCE, _PATIENT_FRAMES = 32, 0.5, 30
 _ITERATIONS = 25
@@ -265,14 +268,25 @@ def _is_likely(layout: FileLayout, information_bits: NDArray[np.uint8], llr: NDA
 
 @dataclass(slots=True, eq=False)
 class _Timeline:
-    """Mapping from burst numbers of an epoch to those of an object."""
+    """Mapping from burst numbers of an epoch to those of an object, and from the picture's columns to the screen's."""
 
     epoch: int
     offset: int
+    placement: Placement
     file: FileState
     #: The first and the last burst with a matching announcement.
     since: int
     until: int
+
+
+@dataclass(slots=True, eq=False)
+class _Candidate:
+    """A burst that may be an announcement, under a placement of its columns."""
+
+    epoch: int
+    number: int
+    placement: Placement
+    buffer: Float32 = field(default_factory=lambda: np.zeros(0, np.float32))
 
 
 class FileSearch:
@@ -294,19 +308,30 @@ class FileSearch:
         self._waiting: list[_Burst] = []
         #: Recent bursts with the timeline by which they were added.
         self._recent: list[tuple[_Timeline, _Burst]] = []
-        self._candidates: list[tuple[int, int, Float32]] = []
+        self._candidates: list[_Candidate] = []
+        self._n_shifted = 0
         #: Bursts of the current frame.
         self._fresh: list[tuple[_Timeline, _Burst]] = []
         #: Sentences about refused files.
         self.notes: list[str] = []
 
-    def knows(self, epoch: int) -> bool:
-        """Whether an announcement of this epoch was read."""
-        return epoch in self._timelines
+    def placement(self, epoch: int) -> Placement | None:
+        """Placement of the columns by the announcements of this epoch; None if there were none."""
+        return self._timelines[epoch][-1].placement if epoch in self._timelines else None
 
-    def add(self, soft: FrameSoftBits, at_last: bool = False) -> list[tuple[FileState, Container]]:
-        """Add bursts and return the files that they complete."""
-        self._look_for_announcements(soft)
+    def add(
+        self, soft: FrameSoftBits, settled: Placement | None, at_last: bool = False
+    ) -> list[tuple[FileState, Container]]:
+        """Add bursts and return the files that they complete; `settled` is the placement of their columns if known."""
+        settled = settled or self.placement(soft.epoch)
+        for number, llr in zip(soft.burst, soft.llr, strict=True):
+            groups = [[settled]] if settled else possible_placements(llr)[: 2 + (self._n_shifted < _MAX_SHIFTED)]
+            self._n_shifted += len(groups) > 2
+            for placement in (placement for group in groups for placement in group):
+                self._look_for_announcement(_Candidate(soft.epoch, int(number), placement), placement.of(llr))
+        # These have too few copies to decide. A batch costs little more than a single attempt.
+        if len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
+            self._try_gathered()
         quantised = ldpc.quantised(soft.llr)
         for number, llr in zip(soft.burst, quantised, strict=True):
             self._enter(_Burst(soft.epoch, int(number), llr), soft.time_s)
@@ -321,32 +346,30 @@ class FileSearch:
 
     # -- announcements -------------------------------------------------------------------------------------------------
 
-    def _look_for_announcements(self, soft: FrameSoftBits) -> None:
-        for number, llr in zip(soft.burst, soft.llr, strict=True):
-            buffer = gathered(self._layout, llr)
-            similarity = same_bits_llr(buffer, float(surprise(llr).sum(dtype=np.float64)))
-            if similarity < _MIN_SIMILARITY or information(buffer).sum() < _TRY_ANNOUNCEMENT * self._layout.code.k:
-                continue
-            if similarity > -_MIN_SIMILARITY:
-                if not self._is_expected(soft.epoch, int(number), buffer):
-                    self._try_candidates([(soft.epoch, int(number), buffer)])
-            elif not self.knows(soft.epoch):
-                self._candidates.append((soft.epoch, int(number), buffer))
-        # These have too few copies to decide. A batch costs little more than a single attempt.
-        if len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
-            self._try_gathered()
+    def _look_for_announcement(self, candidate: _Candidate, llr: Float32) -> None:
+        candidate.buffer = gathered(self._layout, llr)
+        similarity = same_bits_llr(candidate.buffer, float(surprise(llr).sum(dtype=np.float64)))
+        if similarity < _MIN_SIMILARITY:
+            return
+        if information(candidate.buffer).sum() < _TRY_ANNOUNCEMENT * self._layout.code.k:
+            return
+        if similarity > -_MIN_SIMILARITY:
+            if not self._is_expected(candidate):
+                self._try_candidates([candidate])
+        elif candidate.epoch not in self._timelines:
+            self._candidates.append(candidate)
 
-    def _is_expected(self, epoch: int, number: int, buffer: Float32) -> bool:
+    def _is_expected(self, candidate: _Candidate) -> bool:
         """Whether a burst is the announcement that its timeline predicts."""
-        line = _line_of(self._timelines.get(epoch, []), number)
-        burst = 0 if line is None else number + line.offset
+        line = _line_of(self._timelines.get(candidate.epoch, []), candidate.number)
+        burst = 0 if line is None else candidate.number + line.offset
         if line is None or burst % ANNOUNCEMENT_PERIOD or burst >= 1 << 32:
             return False
         coded = replace(line.file.announcement, burst=burst).protected()
         bits = np.unpackbits(np.frombuffer(coded, np.uint8))
-        if line.file.dropped or not is_likely(self._layout, bits, buffer):
+        if line.file.dropped or not is_likely(self._layout, bits, candidate.buffer):
             return False
-        line.until = max(line.until, number)
+        line.until = max(line.until, candidate.number)
         return True
 
     def _try_gathered(self) -> None:
@@ -354,23 +377,24 @@ class FileSearch:
         if candidates:
             self._try_candidates(candidates)
 
-    def _try_candidates(self, candidates: list[tuple[int, int, Float32]]) -> None:
-        words = read_words(self._layout, np.stack([buffer for *_, buffer in candidates]), unprotect_announcement)
-        for (epoch, number, _), word in zip(candidates, words, strict=True):
+    def _try_candidates(self, candidates: list[_Candidate]) -> None:
+        buffers = np.stack([candidate.buffer for candidate in candidates])
+        words = read_words(self._layout, buffers, unprotect_announcement)
+        for candidate, word in zip(candidates, words, strict=True):
             announcement = None if word is None else unprotect_announcement(word)
             if announcement is not None:
-                self._announced(announcement, epoch, number)
+                self._announced(announcement, candidate)
 
-    def _announced(self, announcement: Announcement, epoch: int, number: int) -> None:
+    def _announced(self, announcement: Announcement, candidate: _Candidate) -> None:
         known = self.files.get(announcement.key)
         if known is None or known.dropped:
             known = self._begun(announcement)
             if known is None:
                 return
-        offset = announcement.burst - number
-        lines = self._timelines.setdefault(epoch, [])
-        if not lines or (lines[-1].offset, lines[-1].file) != (offset, known):
-            lines.append(_Timeline(epoch, offset, known, number, number))
+        offset, number, placement = announcement.burst - candidate.number, candidate.number, candidate.placement
+        lines = self._timelines.setdefault(candidate.epoch, [])
+        if not lines or (lines[-1].offset, lines[-1].file, lines[-1].placement) != (offset, known, placement):
+            lines.append(_Timeline(candidate.epoch, offset, placement, known, number, number))
             self._claim(lines)
             del lines[:-_MAX_TIMELINES]
 
@@ -476,4 +500,4 @@ def _enter_bursts(line: _Timeline, bursts: list[_Burst], sign: int) -> None:
     counted = np.array([burst.number + line.offset for burst in bursts], np.int64)
     data = np.flatnonzero(counted % ANNOUNCEMENT_PERIOD)
     if data.size:
-        line.file.add(counted[data], np.stack([bursts[i].llr for i in data]), sign)
+        line.file.add(counted[data], line.placement.of(np.stack([bursts[i].llr for i in data])), sign)

@@ -11,6 +11,7 @@ from rxcli.link.beacons import BeaconSearch
 from rxcli.link.files import FileSearch, FileState, FilesUnderWay
 from rxcli.link.formats import Container
 from rxcli.link.layout import LABEL_BITS
+from rxcli.link.placement import Placement
 from rxcli.link.softbits import MAX_LLR, Event
 from rxcli.types import FrameSoftBits, Message, MessageKind, ObjectProgress, ReceivedObject
 
@@ -30,6 +31,8 @@ class LinkReceiver:
         self._beacons = BeaconSearch(columns, payload_symbols)
         self._files = FileSearch(columns, payload_symbols, self._under_way)
         self._last: FrameSoftBits | None = None
+        #: Placement of the source's columns, None until a message or an announcement decides it.
+        self.placement: Placement | None = None
         #: All messages, in order.
         self.messages: list[Message] = []
 
@@ -45,10 +48,14 @@ class LinkReceiver:
         if soft.burst.size == 0:
             return []
         self._last = soft
-        events: list[Event] = [self._object(soft, *found) for found in self._files.add(soft)]
-        if not self._files.knows(soft.epoch):
-            events += self._new_messages(soft, self._beacons.add(soft))
-        return events
+        events: list[Event] = [self._object(soft, *found) for found in self._files.add(soft, self.placement)]
+        announced = self._files.placement(soft.epoch)
+        if announced is not None:
+            self.placement = announced
+            return events
+        found = self._beacons.add(soft, self.placement)
+        self.placement = found[-1][1] if found else self.placement
+        return events + self._new_messages(soft, [message for message, _ in found])
 
     def finish(self) -> list[Event]:
         """Decode the rest at the end of the transmission."""

@@ -152,17 +152,8 @@ def _receive_screen(
     if result.status == "no_signal":
         result = replace(result, message=too_small(context, acquisition.screen) or assemble.why_no_packet(columns))
     elif outline.column_offset is None:
-        result = replace(result, message=numbered_from_left(result))
+        result = replace(result, message=result.numbering_remark)
     return Received(result, _taps(found, reception))
-
-
-def numbered_from_left(result: FrameResult) -> str:
-    """What the numbers of the columns are worth where the screen's first is not sure."""
-    leftmost = next((column.column for column in result.columns if column.packets), 0)
-    return (
-        f"columns numbered from the leftmost that was seen: it is the screen's column {leftmost} with a probability of "
-        f"{result.column_certainty:.2f}; take one side of the screen into view to have the screen's numbers"
-    )
 
 
 def _taps(found: Found, reception: Reception) -> dict[str, Any]:

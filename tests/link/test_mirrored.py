@@ -1,4 +1,4 @@
-"""Mirrored pictures: texts and files say it themselves, front cameras may be mirrored, and a user may know it."""
+"""Column numbers that a picture leaves open, shifted or mirrored: texts and files decide, or a user knows."""
 
 from __future__ import annotations
 
@@ -12,50 +12,85 @@ from small_frames import N_COLUMNS, write_frame, write_profiles
 from test_receiver import COLUMNS, clip
 
 from rxcli.cli.main import run
-from rxcli.link.collector import Collector
+from rxcli.lab.benchmark.goodput import detect
+from rxcli.link.collector import Collector, PhotoCollector
 from rxcli.link.encoder import file_object, message
+from rxcli.link.placement import Placement, possible_placements
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.runs.api import Receiver
-from rxcli.types import ColumnResult, Frame, FrameResult, FrameSoftBits, Metadata
+from rxcli.types import ColumnResult, Frame, FrameResult, FrameSoftBits, Metadata, PacketResult
 
 SCREEN = load_profile("paper-34k6", ScreenProfile)
+NO = Placement()
 
 
-def result(soft: FrameSoftBits, mirrored: bool, source: str = "a") -> FrameResult:
-    """A frame's result whose first column on the screen is weak, as a camera or a mirror shows it."""
-    first = COLUMNS - 1 if mirrored else 0
-    columns = tuple(ColumnResult(c, "weak" if c == first else "ok") for c in range(COLUMNS))
-    soft = replace(soft, llr=soft.llr[:, :, ::-1] if mirrored else soft.llr, source=source)
-    corners = np.array([[0, 0], [9, 0], [9, 5], [0, 5]], float)
-    return FrameResult(
-        source, 0, 0.0, "ok", screen_profile=SCREEN.name, corners=corners, columns=columns, soft_bits=soft
-    )
+PLACEMENTS = [Placement(mirrored, shift) for mirrored in (False, True) for shift in (-3, -1, 0, 2)]
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_a_text_says_whether_its_picture_is_mirrored(mirrored: bool) -> None:
-    sending = message("hello")
+def result(soft: FrameSoftBits, placement: Placement = NO, source: str = "a") -> FrameResult:
+    """A frame's result as a mirror or a wrong outline shows it; column 9 of the screen has a packet of its own."""
+    soft = replace(soft, llr=placement.inverse.of(soft.llr), source=source)
+    ninth = (COLUMNS - 1 - 9 if placement.mirrored else 9) + placement.inverse.shift
+    packets = (PacketResult(0.0, 1.0, 8, "09", 0.4, 0.0),)
+    columns = tuple(ColumnResult(c, "ok", packets=packets if c == ninth else ()) for c in range(COLUMNS))
+    corners = np.array([[0, 0], [20, 0], [20, 10], [0, 10]], float)
+    told = replace(FrameResult(source, 0, 0.0, "ok", columns=columns), column_certainty=0.5, column_offset=None)
+    message = f"bright; {told.numbering_remark}"
+    return replace(told, screen_profile=SCREEN.name, corners=corners, soft_bits=soft, message=message)
+
+
+@pytest.mark.parametrize("placement", PLACEMENTS)
+def test_a_text_shows_how_the_columns_of_its_picture_lie(placement: Placement) -> None:
     collector = Collector([SCREEN])
-    [soft, *_] = clip(sending, 0, 1, np.random.default_rng(1))
-    got = collector.add(result(soft, mirrored))
+    [soft, *_] = clip(message("hello"), 0, 1, np.random.default_rng(1))
+    got = collector.add(result(soft, placement))
     assert [one.text for one in got.messages] == ["hello"]
-    assert got.mirrored is mirrored
+    assert got.mirrored is placement.mirrored
     assert [column.column for column in got.columns] == list(range(COLUMNS))
-    assert got.columns[0].status == "weak"
+    assert [column.column for column in got.columns if column.packets] == [9]
+    unread = range(placement.shift) if placement.shift > 0 else range(COLUMNS + placement.shift, COLUMNS)
+    assert [column.column for column in got.columns if "--corners" in (column.message or "")] == list(unread)
+    # What was uncertain by its number alone is certain.
+    assert got.columns[9].packets[0].confidence == 0.8
+    assert (got.column_certainty, got.column_offset, got.message) == (1.0, 0, "bright")
     assert got.corners is not None
-    assert got.corners[0, 0] == (9 if mirrored else 0)
+    left = -placement.shift if not placement.mirrored else COLUMNS + placement.shift
+    assert got.corners[0].tolist() == pytest.approx([left, 0], abs=1e-4)
     # What is known of one camera says nothing of another one.
-    other = collector.add(result(replace(soft, llr=0 * soft.llr, epoch=1), False, "b"))
-    assert other.columns[0].status == "weak"
+    other = collector.add(result(replace(soft, llr=0 * soft.llr, epoch=1), source="b"))
+    assert other.columns[9].packets[0].confidence == 0.4
 
 
-def test_a_file_that_comes_only_mirrored_is_received() -> None:
+def test_a_shift_never_leaves_out_a_column_that_carries_bits() -> None:
+    llr = np.full((2, 3, COLUMNS, 7), 9.0)
+    assert possible_placements(llr) == [[NO], [Placement(True)]]
+    llr[..., :2, :] = llr[..., -1:, :] = 0.1
+    *_, shifted = possible_placements(llr)
+    left_free, right_free = 2, 1
+    assert {p.shift for p in shifted if not p.mirrored} == {*range(-left_free, 0), *range(1, right_free + 1)}
+    assert {p.shift for p in shifted if p.mirrored} == {*range(-right_free, 0), *range(1, left_free + 1)}
+
+
+def test_photos_that_are_numbered_differently_add_up() -> None:
+    rng, collector, came = np.random.default_rng(6), PhotoCollector([SCREEN]), []
+    for placement in (NO, Placement(True), Placement(False, 2), Placement(False, -3), NO):
+        llr = detect(message("z" * 150).labels(np.arange(1), COLUMNS, 24), 5, (9.0,) * COLUMNS, rng)
+        llr[:, rng.permutation(24)[:14]] = llr[:, :, -3:] = llr[:, :, :3] = 0
+        came.append(collector.add(result(FrameSoftBits(np.arange(1), llr), placement, source=str(placement))))
+    assert not came[0].messages
+    [*_, last] = came
+    assert [one.text for got in came for one in got.messages] == ["z" * 150]
+    assert [column.column for column in last.columns if column.packets] == [9]
+
+
+@pytest.mark.parametrize("placement", [NO, Placement(True), Placement(False, -1), Placement(True, 2)])
+def test_a_file_whose_columns_are_numbered_wrongly_is_received(placement: Placement) -> None:
     sending = file_object("a.txt", b"data" * 20)
     collector = Collector([SCREEN])
-    got = [collector.add(result(soft, True)) for soft in clip(sending, 0, 60, np.random.default_rng(2))]
+    got = [collector.add(result(soft, placement)) for soft in clip(sending, 0, 40, np.random.default_rng(2))]
     [received] = [one for frame in got for one in frame.objects]
     assert received.data == b"data" * 20
-    assert got[-1].mirrored
+    assert got[-1].columns[9].packets
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Received
-from rxcli.receiver.receive import numbered_from_left
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.grid import grid_between
 from rxcli.receiver.screen.outline import Outline
@@ -124,7 +123,7 @@ def of_doubtful_number(certainty: float) -> FrameResult:
 
 
 def test_a_doubtful_number_is_stated_and_asks_for_no_other_camera() -> None:
-    message = numbered_from_left(of_doubtful_number(0.3))
+    message = of_doubtful_number(0.3).numbering_remark
     assert "numbered from the leftmost that was seen: it is the screen's column 3 with a probability of 0.30" in message
     assert Received(of_doubtful_number(0.3), {}).n_believable == 1
     weak = replace(of_doubtful_number(0.3), column_certainty=1.0)
