@@ -60,18 +60,28 @@ class Collector:
 
 
 class PhotoCollector(Collector):
-    """Link layer of several photos of one transmission, which complete each other."""
+    """Link layer of several photos of one transmission, which complete each other.
+
+    The first photo alone was tried before it comes here, so it is added only with the second one.
+    """
 
     #: Number of photos that were incomplete on their own.
     n_photos = 0
+    _waiting: FrameResult | None = None
 
     def add(self, result: FrameResult) -> FrameResult:
         """Add the messages and files that a photo completes; a result without soft bits is unchanged."""
         if result.soft_bits is None:
             return result
         self.n_photos += 1
-        soft = replace(result.soft_bits, epoch=self.n_photos, source=result.source)
-        return super().add(replace(result, soft_bits=soft))
+        result = replace(result, soft_bits=replace(result.soft_bits, epoch=self.n_photos, source=result.source))
+        if self.n_photos == 1 and not result.progress:
+            self._waiting = result
+            return replace(result, soft_bits=None)
+        if self._waiting is not None:
+            joined, self._waiting = super().add(self._waiting), None
+            result = with_events(result, (*joined.messages, *joined.objects))
+        return super().add(result)
 
 
 def with_events(result: FrameResult, events: Sequence[Event]) -> FrameResult:

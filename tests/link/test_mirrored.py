@@ -16,6 +16,7 @@ from rxcli.lab.benchmark.goodput import detect
 from rxcli.link.collector import Collector, PhotoCollector
 from rxcli.link.encoder import file_object, message
 from rxcli.link.placement import Placement, possible_placements
+from rxcli.link.receiver import LinkReceiver
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.runs.api import Receiver
 from rxcli.types import ColumnResult, Frame, FrameResult, FrameSoftBits, Metadata, PacketResult
@@ -59,6 +60,19 @@ def test_a_text_shows_how_the_columns_of_its_picture_lie(placement: Placement) -
     # What is known of one camera says nothing of another one.
     other = collector.add(result(replace(soft, llr=0 * soft.llr, epoch=1), source="b"))
     assert other.columns[9].packets[0].confidence == 0.4
+
+
+def test_the_first_of_several_photos_is_not_tried_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was tried alone before; with the second one it counts as ever."""
+    add, tried, photos, rng = LinkReceiver.add, [], PhotoCollector([SCREEN]), np.random.default_rng(1)
+    monkeypatch.setattr(LinkReceiver, "add", lambda self, soft: tried.append(soft.source) or add(self, soft))
+    [soft, *_] = clip(message("z" * 190), 0, 1, rng)
+    for name, symbols in (("a", slice(0, 10)), ("b", slice(8, 22))):
+        llr = np.zeros_like(soft.llr[1:2])
+        llr[:, symbols] = soft.llr[1:2, symbols]
+        last = photos.add(result(replace(soft, burst=soft.burst[1:2], llr=llr), source=name))
+        assert [one.text for one in last.messages] == ["z" * 190] * (name == "b")
+        assert tried == {"a": [], "b": ["a", "b"]}[name]
 
 
 def test_a_shift_never_leaves_out_a_column_that_carries_bits() -> None:

@@ -229,7 +229,7 @@ def _packets(result: FrameResult, case: Case) -> Iterator[Record]:
 
 def _texts(results: Sequence[FrameResult], case: Case) -> Iterator[str | None]:
     """The messages that the link layer makes of the results, photographs together."""
-    collector = (PhotoCollector if case.trials else Collector)(case.options.screens)
+    collector = (PhotoCollector if len(case.trials) > 1 else Collector)(case.options.screens)
     for result in results if case.text is not None else ():
         added = collector.add(replace(result, source=SOURCE))
         # A clip's end brings what was left.
