@@ -220,7 +220,7 @@ _CROWDED = 0.7
 
 
 def _decoder_input(code: Code, buffer_llr: NDArray[np.int8], n_rows: int) -> NDArray[np.int16]:
-    """(block columns, z, batch) int16 ln p(0)/p(1), with filler bits known to be zero."""
+    """(block columns * z, batch) int16 ln p(0)/p(1), with filler bits known to be zero."""
     batch, n_bits = buffer_llr.shape
     kb, z = code.information_columns, code.z
     flat = np.zeros(((kb + n_rows) * z, batch), np.int16)
@@ -228,7 +228,14 @@ def _decoder_input(code: Code, buffer_llr: NDArray[np.int8], n_rows: int) -> NDA
     flat[_PUNCTURED * z : _PUNCTURED * z + systematic] = -buffer_llr[:, :systematic].T.astype(np.int16)
     flat[code.k : kb * z] = _KNOWN
     flat[kb * z : kb * z + n_bits - systematic] = -buffer_llr[:, systematic:].T.astype(np.int16)
-    return flat.reshape(kb + n_rows, z, batch)
+    return flat
+
+
+@cache
+def _places(code: Code) -> list[NDArray[np.intp]]:
+    """Of each row of checks: (edges, z) coded bits."""
+    lanes = np.arange(code.z)
+    return [np.stack([column * code.z + (lanes + shift) % code.z for column, shift in row]) for row in code.rows]
 
 
 class _Layers:
@@ -237,53 +244,47 @@ class _Layers:
     Args:
         code: the code.
         n_rows: rows in use.
-        total: (block columns, z, batch) int16 ln p(0)/p(1).
+        total: (block columns * z, batch) int16 ln p(0)/p(1).
     """
 
     def __init__(self, code: Code, n_rows: int, total: NDArray[np.int16]) -> None:
-        self._code, self._rows = code, code.rows[:n_rows]
-        self._begin(total, [np.zeros((len(row), *total.shape[1:]), np.int16) for row in self._rows])
+        self._code, self._rows = code, _places(code)[:n_rows]
+        self._begin(total, [np.zeros((*row.shape, total.shape[1]), np.int16) for row in self._rows])
 
     def _begin(self, total: NDArray[np.int16], messages: list[NDArray[np.int16]]) -> None:
         self._total, self._messages = total, messages
         # Allocating arrays of this size costs more than the computation.
         degree = max(len(row) for row in self._rows)
-        self._incoming = np.empty((degree, *total.shape[1:]), np.int16)
+        self._incoming = np.empty((degree, self._code.z, total.shape[1]), np.int16)
         self._work = np.empty_like(self._incoming)
 
     def keep(self, blocks: NDArray[np.bool_]) -> None:
         """Continue with some blocks of the batch."""
-        total = np.ascontiguousarray(self._total[:, :, blocks])
+        total = np.ascontiguousarray(self._total[:, blocks])
         self._begin(total, [np.ascontiguousarray(message[:, :, blocks]) for message in self._messages])
 
     def information(self, blocks: NDArray[np.int64]) -> Bits:
         """(n, k) hard decisions of some blocks of the batch."""
-        code = self._code
-        negative = (self._total[: code.information_columns] < 0).reshape(-1, self._total.shape[2])
-        return np.asarray(negative.T[blocks, : code.k], np.uint8)
+        return np.asarray((self._total[: self._code.k] < 0).T[blocks], np.uint8)
 
     def unsatisfied(self) -> NDArray[np.float64]:
         """(batch,) share of checks that the hard decisions violate."""
-        count = np.zeros(self._total.shape[2])
+        count = np.zeros(self._total.shape[1])
         for row in self._rows:
             parity = np.bitwise_xor.reduce(self._gather(row), axis=0) < 0
             count += np.count_nonzero(parity, axis=0)
         return count / (len(self._rows) * self._code.z)
 
-    def _gather(self, row: tuple[Edge, ...]) -> NDArray[np.int16]:
-        z, incoming = self._code.z, self._incoming[: len(row)]
-        for place, (column, shift) in enumerate(row):
-            incoming[place, : z - shift] = self._total[column, shift:]
-            incoming[place, z - shift :] = self._total[column, :shift]
-        return incoming
+    def _gather(self, places: NDArray[np.intp]) -> NDArray[np.int16]:
+        return self._total.take(places, axis=0, out=self._incoming[: len(places)], mode="clip")
 
     def update(self) -> None:
         """Run one iteration: each row of checks in turn sends new messages to its bits."""
         for row, message in zip(self._rows, self._messages, strict=True):
             self._update_row(row, message)
 
-    def _update_row(self, row: tuple[Edge, ...], message: NDArray[np.int16]) -> None:
-        z, incoming, work = self._code.z, self._gather(row), self._work[: len(row)]
+    def _update_row(self, row: NDArray[np.intp], message: NDArray[np.int16]) -> None:
+        incoming, work = self._gather(row), self._work[: len(row)]
         incoming -= message
         parity = np.bitwise_xor.reduce(incoming, axis=0)
         np.abs(incoming, out=work)
@@ -300,9 +301,7 @@ class _Layers:
         work ^= message
         np.subtract(work, message, out=message)
         incoming += message
-        for place, (column, shift) in enumerate(row):
-            self._total[column, :shift] = incoming[place, z - shift :]
-            self._total[column, shift:] = incoming[place, : z - shift]
+        self._total[row] = incoming
 
 
 def _two_smallest(magnitude: NDArray[np.int16]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
