@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from rxcli.errors import UsageError, shortened
-from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles, load_profile, shipped_profiles
+from rxcli.profiles import CameraProfile, ScreenProfile, known_profiles, load_profile, shipped_profiles, usual_screens
 from rxcli.types import FILE_MEMORY_MB, Denoiser, FloatArray
 
 CaeMode = Literal["auto", "always", "never"]
@@ -28,7 +28,7 @@ class ReceiverOptions:
     """Options of the receiver; picklable for worker processes."""
 
     #: Screens to try, by default all known ones; the best one is used.
-    screens: tuple[ScreenProfile, ...] = field(default_factory=lambda: tuple(shipped_profiles(ScreenProfile)))
+    screens: tuple[ScreenProfile, ...] = field(default_factory=usual_screens)
     #: Cameras to choose from by make, model and size, by default all known ones; empty: estimate every camera.
     cameras: tuple[CameraProfile, ...] = field(default_factory=lambda: tuple(shipped_profiles(CameraProfile)))
     #: Use `cameras[0]` for every file, regardless of its metadata.
@@ -165,7 +165,8 @@ def _profiles(named: tuple[Any, ...], kind: type[_Profile]) -> tuple[_Profile, .
             raise UsageError(reason, "give a profile of this kind, its name, or a TOML file")
         elif name != AUTO:
             found.append(load_profile(name, kind))
-    return (*found, *([profile for profile, _, _ in known_profiles(kind)] if AUTO in named else ()))
+    known = [profile for profile, _, _ in known_profiles(kind)] if AUTO in named else []
+    return (*found, *(p for p in known if isinstance(p, CameraProfile) or not p.only_named))
 
 
 def _checked_corners(corners: Any) -> FloatArray:

@@ -79,6 +79,8 @@ class ScreenProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     segment_rows: Annotated[int, Meta(ge=1, le=1000)] = 8
     #: Standard deviation of the Gaussian light profile of a segment, segment pitches.
     light_spread: Annotated[float, Meta(ge=0, le=10)] = 0.45
+    #: Not among the screens that are tried if none is named: the start of a long packet looks like a short one.
+    only_named: bool = False
     description: str = ""
 
     @property
@@ -312,6 +314,11 @@ def shipped_profiles(kind: type[_Profile]) -> list[_Profile]:
     """All shipped profiles of one kind, by name."""
     folder = data_dir("calibration") / _KINDS[kind]
     return [load_profile(str(path), kind) for path in sorted(folder.glob("*.toml"))]
+
+
+def usual_screens() -> tuple[ScreenProfile, ...]:
+    """The shipped screens that are tried if none is named."""
+    return tuple(screen for screen in shipped_profiles(ScreenProfile) if not screen.only_named)
 
 
 def dump_profile(profile: ScreenProfile | CameraProfile) -> str:

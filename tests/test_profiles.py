@@ -16,6 +16,7 @@ from PIL import Image
 
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode, ProfileError
+from rxcli.link.layout import beacon_layout
 from rxcli.options import receiver_options
 from rxcli.profiles import (
     CameraProfile,
@@ -102,6 +103,18 @@ def test_screens_for_texts_and_files_are_those_of_the_paper_sending_a_packet_onc
         ours, theirs = (load_profile(name, ScreenProfile) for name in (data, paper))
         assert (ours.repeats, theirs.repeats) == (1, 3)
         assert msgspec.structs.replace(ours, name=paper, repeats=3, description=theirs.description) == theirs
+
+
+@pytest.mark.parametrize(("name", "readout_s", "fill"), [("fast-2ms", 2.4e-3, 0.85), ("fast-5ms", 5.1e-3, 0.92)])
+def test_screens_for_fast_cameras_show_a_packet_and_are_tried_only_by_name(
+    name: str, readout_s: float, fill: float
+) -> None:
+    screen = load_profile(name, ScreenProfile)
+    assert fill * readout_s > screen.packet_s
+    # A text of 63 bytes takes a single burst.
+    assert beacon_layout(64, screen.columns, screen.payload_symbols).period == 1
+    assert screen not in receiver_options().screens
+    assert receiver_options(name).screens == (screen,)
 
 
 @pytest.mark.parametrize(

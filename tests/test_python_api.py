@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import rxcli
 from rxcli.errors import ReceiverError
 from rxcli.options import SKIPS
-from rxcli.profiles import shipped_profiles
+from rxcli.profiles import shipped_profiles, usual_screens
 from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput
 from rxcli.receiver.decode.detect import detect
@@ -61,7 +61,7 @@ def test_defaults_are_the_command_lines() -> None:
     options = rxcli.ReceiverOptions()
     assert rxcli.receiver_options() == options
     assert rxcli.Receiver().options == replace(options, soft_bits=True)
-    assert options.screens == tuple(shipped_profiles(rxcli.ScreenProfile))
+    assert options.screens == usual_screens()
     assert options.cameras == tuple(shipped_profiles(rxcli.CameraProfile))
     assert options.skip == frozenset(SKIPS)
 

@@ -16,7 +16,7 @@ from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.capture import Capture, simulate_frame
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, shipped_profiles
+from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, usual_screens
 from rxcli.receiver import channel, still
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import detect
@@ -180,7 +180,7 @@ def test_a_profile_that_gives_no_packet_is_no_veto(change: dict[str, Any]) -> No
 
 def test_the_right_screen_among_all_is_told() -> None:
     taken = clean()
-    result = received(frame_of(taken), options_for(taken, screens=tuple(shipped_profiles(ScreenProfile))))
+    result = received(frame_of(taken), options_for(taken, screens=usual_screens()))
     assert result.screen_profile == "paper-34k6"
     assert score_of(result, taken).error_free == 20
 
@@ -529,7 +529,7 @@ def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_no
 def test_packets_tell_the_screen(screen: str) -> None:
     """Pictures with strong texture hide all structure of a clock's slots."""
     taken = capture(screen, "phone-plain", "sky", 30.0, 1)
-    options = replace(options_for(taken), screens=tuple(shipped_profiles(ScreenProfile)))
+    options = replace(options_for(taken), screens=usual_screens())
     assert found_in(taken, options).best.acquisition.screen.name == screen
 
 

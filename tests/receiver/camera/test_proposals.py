@@ -18,7 +18,7 @@ from rxcli.lab.simulate.optics import Pose
 from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile, parse_profile, shipped_profiles
+from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile, parse_profile, usual_screens
 from rxcli.receiver import camera as blind
 from rxcli.receiver import plane
 from rxcli.receiver.camera.settings import SETTINGS
@@ -27,7 +27,7 @@ from rxcli.receiver.receive import receive
 from rxcli.receiver.screen import geometry
 from rxcli.types import FloatArray, Frame, Lens, RowProfiles
 
-SCREENS = tuple(shipped_profiles(ScreenProfile))
+SCREENS = usual_screens()
 
 
 def phone(

@@ -18,7 +18,7 @@ from rxcli.ingest import open_source
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import CameraProfile, ScreenProfile, parse_profile, shipped_profiles
+from rxcli.profiles import CameraProfile, ScreenProfile, parse_profile, usual_screens
 from rxcli.receiver import camera as blind
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Failure
@@ -31,7 +31,7 @@ from rxcli.receiver.search.numbers import less_likely_outlines
 from rxcli.receiver.search.propose import Proposer
 from rxcli.types import Frame, FrameResult
 
-SHIPPED = tuple(shipped_profiles(ScreenProfile))
+SHIPPED = usual_screens()
 
 
 def more_screens() -> tuple[ScreenProfile, ...]:
