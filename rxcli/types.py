@@ -80,6 +80,16 @@ class Mosaic:
 
 
 @dataclass(frozen=True, slots=True)
+class Colours:
+    """Read the colours of a developed picture, when they are asked for."""
+
+    #: (h, w, 3) float32: red, green and blue of about every eighth pixel and row, 0 black to 1 white.
+    thinned: Callable[[], Float32Array]
+    #: (height, width) luma of green and blue alone, with the levels of the luma.
+    without_red: Callable[[], NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
     """One camera picture as stored: luma, or the sensor's mosaic."""
 
@@ -101,6 +111,10 @@ class Frame:
     linear: bool = False
     #: True where the source's own times do not advance, so that `time_s` is by its nominal frame rate.
     nominal_time: bool = False
+    #: Of a developed picture; None where nothing but its luma is known.
+    colours: Colours | None = field(default=None, repr=False, compare=False)
+    #: Contrast of the slots in red relative to green, with its standard deviation, where red was left out.
+    red_contrast: tuple[float, float] | None = None
 
     @property
     def height(self) -> int:

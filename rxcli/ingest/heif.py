@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError
-from rxcli.ingest.luma import BT601, BT709, Luma, luma_of
+from rxcli.ingest.luma import BT601, BT709, Weights
 from rxcli.ingest.metadata import exif_metadata
 from rxcli.ingest.orientation import as_stored, orientation_of
 from rxcli.ingest.sniff import check_size, damage_explained
@@ -27,8 +27,8 @@ _PLANES = {420: 1.5, 422: 6.0, 444: 6.0}
 _MATRIX_BT709 = 1
 
 
-def read_heif(data: bytes, path: Path) -> tuple[Luma, Metadata]:
-    """Luma as stored, and metadata with the orientation that the file asks for.
+def read_heif(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]:
+    """Samples as stored, and metadata with the orientation that the file asks for, and the weights of luma.
 
     Raises:
         InputError: damaged, or the extra is not installed.
@@ -44,12 +44,12 @@ def read_heif(data: bytes, path: Path) -> tuple[Luma, Metadata]:
         check_size(path, width, height, _bytes_a_pixel(file, turned != 1), len(data))
         pixels = np.asarray(file)
     matrix = (file.info.get("nclx_profile") or {}).get("matrix_coefficients")
-    luma = luma_of(pixels, BT709 if matrix == _MATRIX_BT709 else BT601)
     metadata = exif_metadata(file.info.get("exif") or b"")
     if metadata.orientation not in (1, turned):
         doubt = f"EXIF orientation {metadata.orientation} (HEIC has rotations of its own; columns may be reversed)"
         metadata = replace(metadata, not_believed=(*metadata.not_believed, doubt))
-    return as_stored(luma, turned), replace(metadata, orientation=turned)
+    weights = BT709 if matrix == _MATRIX_BT709 else BT601
+    return as_stored(pixels, turned), replace(metadata, orientation=turned), weights
 
 
 def _bytes_a_pixel(file: Any, is_turned: bool) -> float:

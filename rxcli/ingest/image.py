@@ -11,6 +11,7 @@ import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from rxcli.errors import InputError
 from rxcli.ingest.extent import claims_too_much
-from rxcli.ingest.luma import Luma, luma_of
+from rxcli.ingest.luma import BT601, Luma, Weights, colours_of, luma_of
 from rxcli.ingest.metadata import exif_metadata, jpeg_metadata, tiff_metadata
 from rxcli.ingest.quiet import quiet_libraries
 from rxcli.ingest.sniff import Kind, check_size, damage_explained, read_bytes
@@ -41,21 +42,27 @@ def read_image(path: Path, kind: Kind) -> Frame:
         return _read_tiff(path)
     data = read_bytes(path)
     if kind == "jpeg":
-        from rxcli.ingest.jpeg import decode_luma
+        from rxcli.ingest import jpeg
 
-        return _frame(path, decode_luma(data, path), jpeg_metadata(data))
+        frame = _frame(path, jpeg.decode_luma(data, path), jpeg_metadata(data))
+        return replace(frame, colours=jpeg.colours_of(data))
     if kind == "png":
         return _read_png(data, path)
     if kind == "heif":
         from rxcli.ingest.heif import read_heif
 
-        return _frame(path, *read_heif(data, path))
-    return _frame(path, *_read_with_pillow(data, path))
+        return _colour_frame(path, *read_heif(data, path))
+    return _colour_frame(path, *_read_with_pillow(data, path))
 
 
 def _frame(path: Path, luma: Luma, metadata: Metadata, linear: bool = False, white: int = 0) -> Frame:
     white = white or np.iinfo(luma.dtype).max
     return Frame(pixels=luma, source=str(path), metadata=metadata, white=float(white), linear=linear)
+
+
+def _colour_frame(path: Path, rgb: NDArray[Any], metadata: Metadata, weights: Weights = BT601) -> Frame:
+    """The frame of grey or RGB samples, whose colours it keeps."""
+    return replace(_frame(path, luma_of(rgb, weights), metadata), colours=colours_of(rgb, weights))
 
 
 def _read_png(data: bytes, path: Path) -> Frame:
@@ -77,7 +84,7 @@ def _read_png(data: bytes, path: Path) -> Frame:
     if bgr is None:
         raise InputError(f"{path}: the PNG is damaged", "copy the file again")
     rgb = bgr if bgr.ndim == 2 else bgr[:, :, 2::-1]
-    return _frame(path, luma_of(rgb), exif_metadata(bytes(by_name.get(b"eXIf", b""))[8:-4]))
+    return _colour_frame(path, rgb, exif_metadata(bytes(by_name.get(b"eXIf", b""))[8:-4]))
 
 
 #: ISO 15948, table 11.1: samples of a pixel as OpenCV decodes it, by colour type; some may get an alpha.
@@ -133,9 +140,11 @@ def _read_tiff(path: Path) -> Frame:
         if page.photometric == _PALETTE:
             pixels = (luma_of(page.colormap.T[None])[0] >> 8).astype(np.uint8)[pixels]
         luma, linear = _tiff_luma(pixels, path)
+        colours = colours_of(pixels) if pixels.dtype == luma.dtype and page.photometric != _MIN_IS_WHITE else None
         is_packed = page.dtype.kind == "u" and page.photometric != _PALETTE and 1 < page.bitspersample < _PACKED_BITS
     white = (1 << page.bitspersample) - 1 if is_packed else np.iinfo(luma.dtype).max
-    return _frame(path, white - luma if page.photometric == _MIN_IS_WHITE else luma, metadata, linear, white)
+    frame = _frame(path, white - luma if page.photometric == _MIN_IS_WHITE else luma, metadata, linear, white)
+    return replace(frame, colours=colours)
 
 
 def _picture_page(tiff: Any) -> Any:
@@ -222,4 +231,4 @@ def _read_with_pillow(data: bytes, path: Path) -> tuple[NDArray[np.uint8], Metad
     ):
         check_size(path, *image.size, 18, len(data))  # measured: WebP without loss takes most
         pixels = np.asarray(image if image.mode in ("L", "RGB") else image.convert("RGB"))
-        return np.asarray(luma_of(pixels), np.uint8), exif_metadata(image.info.get("exif") or b"")
+        return np.asarray(pixels, np.uint8), exif_metadata(image.info.get("exif") or b"")

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError, reason_of
+from rxcli.ingest.luma import BT601, as_shares, luma_of, without_red
 from rxcli.ingest.quiet import quiet_libraries
 from rxcli.ingest.sniff import check_size, damage_explained
+from rxcli.types import Colours
 
 #: What simplejpeg raises.
 _FAULTS = (ValueError, KeyError, MemoryError, OverflowError)
@@ -28,6 +30,8 @@ _MARKER = re.compile(rb"\xff[^\x00\x01\xff\xd0-\xd7]")
 _ARITHMETIC = 0xC9
 #: Coefficients of a block.
 _BLOCK = 64
+#: OpenCV's flags for a picture in colour: the means of blocks of eight by eight pixels, and all of it.
+_EIGHTH, _WHOLE = 65, 1
 #: Encoders use some ten scans, each over the whole picture, and notes some hundred segments.
 _MAX_SCANS, _MAX_SEGMENTS = 100, 1 << 14
 _SURPLUS = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
@@ -59,6 +63,19 @@ def decode_luma(data: Any, source: object, at_once: int = 1) -> NDArray[np.uint8
         return _gray(data)
     except _FAULTS:
         return _decode_odd(*_picture_of(data), source)
+
+
+def colours_of(data: bytes) -> Colours:
+    """The colours of a JPEG picture whose luma was decoded, as stored."""
+
+    def decoded(size: int) -> NDArray[np.uint8]:
+        import cv2
+
+        with quiet_libraries():
+            bgr = cv2.imdecode(np.frombuffer(data, np.uint8), size | cv2.IMREAD_IGNORE_ORIENTATION)
+        return np.zeros((1, 1, 3), np.uint8) if bgr is None else np.asarray(bgr[:, :, ::-1], np.uint8)
+
+    return Colours(lambda: as_shares(decoded(_EIGHTH)), lambda: luma_of(decoded(_WHOLE), without_red(BT601)))
 
 
 def frame_of(data: bytes) -> tuple[int, int, float, bool]:

@@ -22,15 +22,18 @@ from rxcli.errors import InputError, reason_of
 from rxcli.ingest.ahead import read_ahead
 from rxcli.ingest.damage import WholeFrames
 from rxcli.ingest.ends import is_cut
+from rxcli.ingest.luma import BT601, BT709, THINNED
 from rxcli.ingest.metadata import clip_metadata
 from rxcli.ingest.orientation import orientation_of_turn
 from rxcli.ingest.sniff import MAX_BYTES, check_size, damage_explained
 from rxcli.ingest.times import FrameTimes
-from rxcli.types import Frame, Metadata
+from rxcli.types import Colours, Float32Array, Frame, Metadata
 
 #: ITU-T H.273: samples use 16..235 of 8 bits, or all of them (FFmpeg's AVCOL_RANGE_JPEG).
 _FULL_RANGE = 2
 _LIMITED_BLACK, _LIMITED_WHITE = 16, 235
+#: Range of chroma over that of luma there, and the number of BT.709 among matrices.
+_CHROMA_RANGE, _BT709 = 224 / 219, 1
 #: FFmpeg's orders of fields whose lower one is taken first (AV_FIELD_BB, AV_FIELD_TB).
 _LOWER_FIRST = (3, 4)
 #: Columns whose rows are compared to see whether a frame is two fields.
@@ -199,21 +202,23 @@ def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Ite
 
 
 def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
-    from rxcli.ingest.jpeg import decode_luma
+    from rxcli.ingest.jpeg import colours_of, decode_luma
 
     limited = stream.codec_context.color_range not in (0, _FULL_RANGE)
     black, white = (_LIMITED_BLACK, _LIMITED_WHITE) if limited else (0, 255)
-    waiting: deque[tuple[tuple[float, bool], Future[NDArray[np.uint8]]]] = deque()
+    waiting: deque[tuple[tuple[float, bool], bytes, Future[NDArray[np.uint8]]]] = deque()
     with ThreadPoolExecutor(_MJPEG_THREADS) as pool:
         for packet, _ in _packets(container, stream, progress):
             if packet is not None:
-                picture = pool.submit(decode_luma, bytes(packet), path, at_once=_MJPEG_AT_ONCE)
-                waiting.append((_time_s(packet, stream, progress), picture))
+                data = bytes(packet)
+                picture = pool.submit(decode_luma, data, path, at_once=_MJPEG_AT_ONCE)
+                waiting.append((_time_s(packet, stream, progress), data, picture))
             while len(waiting) > (_MJPEG_THREADS if packet is not None else 0):
-                (time_s, nominal), picture = waiting.popleft()
+                (time_s, nominal), data, picture = waiting.popleft()
                 try:
                     pixels = picture.result()
-                    yield Frame(pixels, str(path), 0, time_s, black=black, white=white, nominal_time=nominal)
+                    frame = Frame(pixels, str(path), 0, time_s, black=black, white=white, nominal_time=nominal)
+                    yield replace(frame, colours=colours_of(data))
                 except InputError as error:
                     progress.damage(str(error).removeprefix(f"{path}: "))
 
@@ -250,7 +255,39 @@ def _frame(path: Path, frame: Any, stream: Any, progress: _Progress) -> Frame:
     bits = frame.format.components[0].bits
     black, white = _levels(frame, bits)
     pixels = _plane(frame.planes[0], frame.width, frame.height, np.uint8 if bits == 8 else np.uint16)
-    return Frame(pixels, str(path), 0, time_s, metadata, black=black, white=white, nominal_time=nominal)
+    colours = _colours(frame, pixels, black, white)
+    return Frame(
+        pixels, str(path), 0, time_s, metadata, black=black, white=white, nominal_time=nominal, colours=colours
+    )
+
+
+def _colours(frame: Any, luma: NDArray[Any], black: float, white: float) -> Colours | None:
+    """The colours of a frame with planes of chroma (ITU-T H.273, equations 38 to 40); None of others."""
+    if not frame.format.name.startswith(("yuv4", "yuvj4")) or len(frame.planes) != 3:
+        return None
+    blue, red = (_plane(plane, plane.width, plane.height, luma.dtype.type) for plane in frame.planes[1:])
+    of_red, of_green, of_blue = BT709 if frame.colorspace == _BT709 else BT601
+    full, middle = white - black, 1 << (frame.format.components[0].bits - 1)
+    chroma = full * _CHROMA_RANGE if black else full
+
+    def thinned() -> Float32Array:
+        import cv2
+
+        size = (luma.shape[1] // THINNED, luma.shape[0] // THINNED)
+        y, b, r = (
+            cv2.resize(plane, size, interpolation=cv2.INTER_AREA).astype(np.float32) for plane in (luma, blue, red)
+        )
+        y = (y - black) / full
+        r, b = y + (r - middle) * (2 * (1 - of_red) / chroma), y + (b - middle) * (2 * (1 - of_blue) / chroma)
+        return np.asarray(np.stack([r, (y - of_red * r - of_blue * b) / of_green, b], axis=-1), np.float32)
+
+    def without_red() -> NDArray[Any]:
+        import cv2
+
+        share = 2 * of_red * full / chroma
+        return np.asarray(cv2.addWeighted(luma, 1, cv2.resize(red, luma.shape[::-1]), -share, share * middle))
+
+    return Colours(thinned, without_red)
 
 
 def _fields(frame: Frame, decoded: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
@@ -269,6 +306,7 @@ def _fields(frame: Frame, decoded: Any, stream: Any, progress: _Progress) -> Ite
         yield frame
         return
     lower = int(stream.codec_context.field_order in _LOWER_FIRST)
+    frame = replace(frame, colours=None)
     yield replace(frame, pixels=frame.pixels[lower::2])
     yield replace(frame, pixels=frame.pixels[1 - lower :: 2], time_s=frame.time_s + _frame_s(stream) / 2)
 

@@ -20,6 +20,7 @@ from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.in_common import named
 from rxcli.receiver.frame.passes import Reception, headerless, soft_bits
 from rxcli.receiver.frame.result import Failure, Received, failed
+from rxcli.receiver.plane import in_one_mix
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.attempts import receive_either_way
@@ -55,7 +56,7 @@ def receive(frames: Iterable[Frame], options: ReceiverOptions, on_taps: OnTaps |
             return
         from rxcli.receiver.clip import receive_clip
 
-        for received in receive_clip(chain((frame_0, frame_1), source), options, on_taps):
+        for received in receive_clip(in_one_mix(chain((frame_0, frame_1), source)), options, on_taps):
             result = named(received, options)
             yield result.with_columns_mirrored() if options.mirrored else result
 
@@ -76,7 +77,7 @@ def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None
     """Receive one frame as a photograph; see `receive`."""
     cache = FrameCache(frame)
     with one_blas_thread():
-        received = receive_either_way(cache, _in_total_order(options), _receive_still)
+        received = receive_either_way(cache.in_blinking_colours(), _in_total_order(options), _receive_still)
     if on_taps is not None and received.taps:
         on_taps(frame.source, frame.index, received.taps)
     claims = ", ".join(frame.metadata.not_believed) if received.result.packets else ""
@@ -141,7 +142,7 @@ def _receive_screen(
         nothing,
         status=assemble.frame_status(columns),
         **outline.result_fields,
-        **camera.result_fields,
+        **context.result_fields,
         search=tuple(tried.step for tried in found.tried),
         screen_profile=acquisition.variant(sync.likely_repeats(reception.clock, acquisition.repeats)).name,
         columns=columns,

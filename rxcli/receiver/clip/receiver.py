@@ -170,7 +170,7 @@ def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | 
         waiting.update(status=view.status, message=view.message, timing_ms=cache.timer.total())
         return state, ledger.add(waiting, scene_ends=True)
     waiting.update(
-        **view.context.camera.result_fields,
+        **view.context.result_fields,
         message=message or state.known.camera.message,
         screen_profile=view.acquisition.screen.name,
         corners=state.known.corners,

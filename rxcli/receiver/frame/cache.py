@@ -10,7 +10,14 @@ from typing import Any
 import numpy as np
 
 from rxcli.receiver.frame.timer import Timer
-from rxcli.receiver.plane import read_plane, sample_rows, strips_per_column
+from rxcli.receiver.plane import (
+    in_blinking_colours,
+    may_lag,
+    read_plane,
+    red_contrast,
+    sample_rows,
+    strips_per_column,
+)
 from rxcli.receiver.screen import geometry
 from rxcli.types import Float32Array, FloatArray, Frame, Lens, LightPlane, Metadata, Outlines, RowProfiles
 
@@ -30,6 +37,13 @@ class FrameCache:
         self.frame, self.timer = frame, timer or Timer()
         self._sampled: list[tuple[str, Float32Array, RowProfiles]] = []
         self._outlines: dict[tuple[Any, ...], Outlines] = {}
+
+    def in_blinking_colours(self) -> FrameCache:
+        """The same picture, in green and blue alone if its red lags behind the slots."""
+        with self.timer("geometry"):
+            contrast = red_contrast(self.frame) if may_lag(self.plane) else None
+            frame = in_blinking_colours(self.frame, contrast)
+        return self if frame is self.frame else FrameCache(frame, self.timer)
 
     def with_metadata(self, metadata: Metadata) -> FrameCache:
         """The same picture with other metadata; what was read of it is kept."""

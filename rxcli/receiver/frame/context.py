@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.camera import in_time_order
@@ -32,6 +33,12 @@ class FrameContext:
     def timer(self) -> Timer:
         """Counts the time of each stage."""
         return self.cache.timer
+
+    @property
+    def result_fields(self) -> dict[str, Any]:
+        """Fields of a result, by name."""
+        fields, red = self.camera.result_fields, self.frame.red_contrast
+        return fields if red is None else {**fields, "estimated": {**fields["estimated"], "red_contrast": red}}
 
     def outlines(self, n_columns: int) -> Outlines:
         """Outlines of the strips of a screen of `n_columns` columns."""

@@ -53,8 +53,8 @@ class Received(NamedTuple):
 def failed(result: FrameResult, failure: Failure) -> FrameResult:
     """Result of a failed reception with its reason."""
     # An estimated camera without packets is not reliable.
-    camera = failure.context.camera if failure.context and failure.context.camera.hypothesis is None else None
-    facts = {**(failure.outline.result_fields if failure.outline else {}), **(camera.result_fields if camera else {})}
+    context = failure.context if failure.context and failure.context.camera.hypothesis is None else None
+    facts = {**(failure.outline.result_fields if failure.outline else {}), **(context.result_fields if context else {})}
     result = replace(result, **facts)
     return replace(
         result,

@@ -1,6 +1,17 @@
 """Pixels to row profiles: each pixel of a frame is read once, into a plane from which profiles are sampled."""
 
+from rxcli.receiver.plane.colour import in_blinking_colours, in_one_mix, may_lag, red_contrast
 from rxcli.receiver.plane.read import read_plane, turned
 from rxcli.receiver.plane.rows import sample_rows, strips_per_column, tone_to_light
 
-__all__ = ["read_plane", "sample_rows", "strips_per_column", "tone_to_light", "turned"]
+__all__ = [
+    "in_blinking_colours",
+    "in_one_mix",
+    "may_lag",
+    "read_plane",
+    "red_contrast",
+    "sample_rows",
+    "strips_per_column",
+    "tone_to_light",
+    "turned",
+]

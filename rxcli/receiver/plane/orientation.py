@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.types import FloatArray, Frame, FrameResult
+from rxcli.types import Colours, FloatArray, Frame, FrameResult
 
 #: Orientations in which the file asks for a quarter turn, and the turns by which a picture may have been turned.
 PORTRAIT, QUARTER_TURNS = (5, 6, 7, 8), (1, 3)
@@ -16,7 +16,11 @@ PORTRAIT, QUARTER_TURNS = (5, 6, 7, 8), (1, 3)
 def turned_frame(frame: Frame, quarter_turns: int) -> Frame:
     """The frame turned counter-clockwise, as a picture that asks for no turn."""
     pixels: Any = np.ascontiguousarray(np.rot90(frame.pixels, quarter_turns))
-    return replace(frame, pixels=pixels, metadata=replace(frame.metadata, orientation=1))
+    stored = frame.colours
+    colours = stored and Colours(
+        lambda: np.rot90(stored.thinned(), quarter_turns), lambda: np.rot90(stored.without_red(), quarter_turns)
+    )
+    return replace(frame, pixels=pixels, metadata=replace(frame.metadata, orientation=1), colours=colours)
 
 
 def turned_points(points: FloatArray, frame: Frame, quarter_turns: int) -> FloatArray:

@@ -117,8 +117,8 @@ def _mosaic_weights(mosaic: Mosaic) -> tuple[Float32Array, Float32Array, bool]:
     pattern = mosaic.pattern
     n = pattern.shape[1]
     present = np.stack([(pattern == colour).sum(axis=1) for colour in range(3)], axis=1)
-    complete = bool((present > 0).all())
     mix = 1 / np.maximum(np.array(mosaic.gains), 1.0) ** 2
+    complete = bool((present > 0)[:, mix > 0].all())
     share = n * mix / mix.sum() / np.maximum(present, 1) if complete else np.ones(present.shape)
     black = np.array(mosaic.black)
     weights = share[np.arange(pattern.shape[0])[:, None], pattern] / (mosaic.white - black.mean())

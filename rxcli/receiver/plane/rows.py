@@ -63,7 +63,7 @@ def sample_rows(plane: LightPlane, outlines: Outlines, tone: str) -> RowProfiles
     widths[enclosed <= _MIN_ENCLOSED * plane.cell_px] = np.inf
     light /= widths
     inside = outlines.inside
-    light = _light_of(plane, light, tone).reshape(inside.shape)
+    light = light_of(plane, light, tone).reshape(inside.shape)
     light *= inside
     count = np.median(enclosed[:, ::_COUNT_ROW_STEP], axis=1)
     cells = max(int(np.median(count) / (_PARTS_PER_STRIP * plane.cell_px)), 1)
@@ -97,7 +97,7 @@ def _sums_at(sums: Float32Array, edges: Float32Array, first_row: int) -> Float32
     return left
 
 
-def _light_of(plane: LightPlane, values: Float32Array, tone: str) -> Float32Array:
+def light_of(plane: LightPlane, values: Float32Array, tone: str) -> Float32Array:
     """Linear light of mean values."""
     encoded = (values - np.float32(plane.black)) * np.float32(1 / (plane.white - plane.black))
     if plane.is_linear or tone == "linear":
@@ -118,7 +118,7 @@ def _noise_model(plane: LightPlane, sums: Float32Array, part_px: int, tone: str)
     floor and slope at least zero.
     """
     every = max(sums.shape[1] // _NOISE_ROWS, 1)
-    parts = _light_of(plane, np.diff(sums[:, every // 2 :: every], axis=0) / np.float32(part_px), tone)
+    parts = light_of(plane, np.diff(sums[:, every // 2 :: every], axis=0) / np.float32(part_px), tone)
     if parts.shape[0] < 2:
         return 1e-6 * part_px, 0.0
     difference = np.abs(np.diff(parts, axis=0)).ravel()

@@ -48,7 +48,7 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
     attempts = []
     for quarter_turns in orientation.QUARTER_TURNS if lean < 0 else ():
         back = orientation.turned_frame(frame, quarter_turns)
-        attempt = receive(FrameCache(back, cache.timer), options)
+        attempt = receive(FrameCache(back, cache.timer).in_blinking_colours(), options)
         result = orientation.as_stored(back, attempt.result, quarter_turns)
         if not _gives_few(result):
             rank = not _is_reversed(result), attempt.n_believable, quarter_turns

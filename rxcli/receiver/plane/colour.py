@@ -1,0 +1,104 @@
+"""Red that lags: the phosphors of many backlights go on glowing for milliseconds, so that red does not blink.
+
+Such a picture is read from green and blue alone. Differences between neighbouring rows decide it: relative to the
+light, they are as large in red as in green, or red has none. Stripes are wider than a cell of pixels, so that noise is
+left out by comparing with green in the cells beside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from rxcli.receiver.plane.rows import light_of
+from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
+
+#: Cells across a picture, their width in pixels, and rows of a block, in which each is dark and lit once.
+_N_CELLS, _CELL_PX, _BLOCK_ROWS = 48, 12, 96
+#: Light of dark slots over that of lit ones up to which red blinks, or hardly counts.
+_PLAIN_DARK = 0.02
+#: Red blinks or not, with a contrast of 1 or 0; standard errors from the middle that decide it.
+_MIDDLE, _SURE = 0.5, 3.0
+#: Values of a colour, of the largest one, that are too dark to compare, and from which they may be clipped.
+_DARK, _CLIPPED = 0.01, 0.98
+#: Gain of a colour of the mosaic that is left out.
+_LEFT_OUT = float("inf")
+
+
+def may_lag(plane: LightPlane) -> bool:
+    """Whether the dark slots of a picture leave as much luma as red does that lags."""
+    n_cells = len(plane.sums) - 1
+    width, n_blocks = max(_CELL_PX // plane.cell_px, 1), plane.height // _BLOCK_ROWS
+    if n_cells < width or not n_blocks:
+        return False
+    left = np.linspace(0, n_cells - width, _N_CELLS).astype(int)
+    rows = slice(n_blocks * _BLOCK_ROWS)
+    values = (plane.sums[left + width, rows] - plane.sums[left, rows]) / np.float32(width * plane.cell_px)
+    blocks = light_of(plane, values, "srgb").reshape(_N_CELLS, n_blocks, -1)
+    dark, lit = blocks.min(axis=2), np.maximum(blocks.max(axis=2), np.float32(_PLAIN_DARK**2))
+    return bool(np.median((dark / lit)[lit >= np.median(lit)]) > _PLAIN_DARK)
+
+
+def in_blinking_colours(frame: Frame, contrast: tuple[float, float] | None) -> Frame:
+    """The frame in green and blue alone if its `red_contrast` shows that red lags, else as it is."""
+    if contrast is None or contrast[0] > _MIDDLE:
+        return frame
+    if frame.mosaic is not None:
+        return replace(frame, mosaic=replace(frame.mosaic, gains=(_LEFT_OUT, 1.0, _LEFT_OUT)), red_contrast=contrast)
+    pixels = frame.pixels if frame.colours is None else frame.colours.without_red()
+    return replace(frame, pixels=pixels, red_contrast=contrast) if pixels.shape == frame.pixels.shape else frame
+
+
+def in_one_mix(frames: Iterable[Frame]) -> Iterator[Frame]:
+    """The frames of a clip in the colours that blink in its first frame with slots."""
+    contrast = None
+    for frame in frames:
+        contrast = contrast or red_contrast(frame)
+        yield in_blinking_colours(frame, contrast)
+
+
+def red_contrast(frame: Frame) -> tuple[float, float] | None:
+    """Contrast of the slots in red relative to green, with its standard deviation.
+
+    None if neither light that blinks nor light that does not is ruled out: without colours, or without slots.
+    """
+    if frame.mosaic is not None:
+        thinned = _thinned(frame, frame.mosaic)
+    elif frame.colours is not None:
+        thinned = frame.colours.thinned()
+    else:
+        return None
+    if thinned.shape[1] < _N_CELLS or len(thinned) < 2:
+        return None
+    import cv2
+
+    cells = cv2.resize(thinned, (_N_CELLS, len(thinned)), interpolation=cv2.INTER_AREA)
+    mean, step = (cells[1:] + cells[:-1]) / 2, np.diff(cells, axis=0)
+    red, green = step[..., 0] / np.maximum(mean[..., 0], _DARK), step[..., 1] / np.maximum(mean[..., 1], _DARK)
+    faintest, brightest = mean[..., :2].min(axis=-1), np.maximum(cells[1:], cells[:-1]).max(axis=-1)
+    weight = np.square(faintest) * (faintest > _DARK) * (brightest < _CLIPPED)
+    beside = np.zeros_like(green)
+    beside[:, 1:] += green[:, :-1]
+    beside[:, :-1] += green[:, 1:]
+    shared, own = (np.einsum("rc,rc,rc->c", weight, values, beside) for values in (red, green))
+    total = float(own.sum())
+    if total <= 0:
+        return None
+    contrast = float(shared.sum()) / total
+    error = float(np.sqrt(np.square(shared - contrast * own).sum())) / total
+    return (contrast, error) if abs(contrast - _MIDDLE) > _SURE * error else None
+
+
+def _thinned(frame: Frame, mosaic: Mosaic) -> Float32Array:
+    """(rows, cells, 3) mean of every colour of a mosaic, in cells of one period's rows, 0 black to 1 white."""
+    period, width = mosaic.pattern.shape
+    n_rows, n_pixels = frame.height // period, max(_CELL_PX // width, 1) * width
+    cells = []
+    for left in np.linspace(0, (frame.width - n_pixels) // width, _N_CELLS).astype(int) * width:
+        part = frame.pixels[: n_rows * period, left : left + n_pixels].reshape(n_rows, period, -1, width)
+        by_place = part.mean(axis=2, dtype=np.float32)
+        cells.append([by_place[:, mosaic.pattern == colour].mean(axis=1) for colour in range(3)])
+    black = np.array(mosaic.black, np.float32)
+    return np.asarray((np.array(cells, np.float32).transpose(2, 0, 1) - black) / (mosaic.white - black), np.float32)
