@@ -165,8 +165,8 @@ def _profiles(named: tuple[Any, ...], kind: type[_Profile]) -> tuple[_Profile, .
             raise UsageError(reason, "give a profile of this kind, its name, or a TOML file")
         elif name != AUTO:
             found.append(load_profile(name, kind))
-    known = [profile for profile, _, _ in known_profiles(kind)] if AUTO in named else []
-    return (*found, *(p for p in known if isinstance(p, CameraProfile) or not p.only_named))
+    known: list[_Profile] = [profile for profile, _, _ in known_profiles(kind)] if AUTO in named else []
+    return (*found, *(profile for profile in known if not getattr(profile, "only_named", False)))
 
 
 def _checked_corners(corners: Any) -> FloatArray:
