@@ -38,7 +38,8 @@ def straightened(strips: ColumnStrips, level: Float32Array, curvature: FloatArra
 def likeliest_bend(strips: ColumnStrips, level: Float32Array) -> FloatArray:
     """(4,) bend, other than none, under which the levelled light (M, R) of neighbouring columns is most similar."""
     strips_per_column = level.shape[0] // strips.n_columns
-    level, moved = level[::strips_per_column], _moved_rows(strips, strips_per_column, _UNIT)
+    level = np.ascontiguousarray(level[::strips_per_column])
+    moved = _moved_rows(strips, strips_per_column, _UNIT)
     bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, 16)
     straight = (_moved(level, bend * moved) for bend in bends)
     return np.asarray(bends[np.argmax([(light[:-1] * light[1:]).sum() for light in straight])] * _UNIT)
@@ -52,10 +53,12 @@ def _moved_rows(strips: ColumnStrips, step: int, curvature: FloatArray) -> Float
 
 def _moved(level: Float32Array, moved: FloatArray) -> Float32Array:
     """Row r shows sensor row r + moved(r); sensor row s is found at s - moved(s), to first order of a small slope."""
-    index = np.arange(level.shape[1])
-    back = np.take_along_axis(moved, np.clip(np.rint(index - moved), 0, index[-1]).astype(np.int64), 1)
-    place = np.clip(index - back, 0, index[-1] - 1e-6)
-    low = place.astype(np.int64)
-    below, above = np.take_along_axis(level, low, 1), np.take_along_axis(level, low + 1, 1)
+    # Flat places: take_along_axis makes as many index arrays as there are axes.
+    index, start = np.arange(level.shape[1]), level.shape[1] * np.arange(len(level))[:, None]
+    nearest = np.rint(index - moved).clip(0, index[-1]).astype(np.intp)
+    back = moved.take(nearest + start)
+    place = (index - back).clip(0, index[-1] - 1e-6)
+    low = place.astype(np.intp)
+    below, above = level.take(low + start), level.take(low + start + 1)
     out = below + (above - below) * (place - low).astype(np.float32)
     return np.asarray(out * (np.abs(index - back - place) < 0.5), np.float32)
