@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from small_frames import write_frame, write_profiles
 
 from rxcli.cli.benchmark import benchmark
 from rxcli.cli.main import run
@@ -27,6 +28,7 @@ from rxcli.lab.benchmark.media import bare_decode, write_known
 from rxcli.lab.benchmark.runner import Run, Task, do, load_journal, scenarios
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
+from rxcli.options import receiver_options
 from rxcli.receiver.receive import receive
 from rxcli.types import FrameResult
 
@@ -71,6 +73,21 @@ def test_another_kernel_is_another_processs(easy: Trial) -> None:
     here, there = (received(case_of(easy), way) for way in ("receiver", cases.OTHER_KERNEL))
     assert (here["kernel"], there["kernel"]) == (os.environ.get("OPENBLAS_CORETYPE"), cases.KERNEL)
     assert there["score"]["error_free"] == there["score"]["expected"]
+
+
+def test_the_command_receives_the_same_and_its_start_counts(tmp_path: Path) -> None:
+    payloads, names = write_frame(tmp_path / "a.png", 3), write_profiles(tmp_path)
+    corners = np.array([[float(part) for part in text.split(",")] for text in names[5:]])
+    options = replace(receiver_options(names[1], names[3]), corners=corners)
+    case = Case(source=(tmp_path / "a.png",), options=options, about={})
+    here, command = (received(case, way) for way in ("receiver", "command"))
+    for record in (here, command):
+        assert [packet["payload"] for packet in record["packets"]] == payloads
+    assert command["cpu_s"] > here["cpu_s"] + 0.1
+    row = measures.rows(
+        [{"groups": [], "has_data": True, "ways": {"command": command}}] * 2, ["command"], ["packets_each"]
+    )
+    assert row[-1]["packets_each"] == len(payloads)
 
 
 def test_what_a_reception_raises_warns_or_says_wrongly_is_a_problem(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import subprocess
+import sys
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,6 +31,7 @@ from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.outputs import write_whole
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile
 from rxcli.receiver.receive import receive
+from rxcli.results.record import from_record
 from rxcli.results.truth import Scorer, Truth, truth_path
 from rxcli.runs.processes import ONE_THREAD, environment, peak_memory_mb, start_process
 from rxcli.types import FloatArray, Frame, FrameResult
@@ -122,6 +126,14 @@ def _on_two_threads(case: Case) -> Iterator[FrameResult]:
         yield from case.receive(case.options)
 
 
+def _by_command(case: Case) -> Iterator[FrameResult]:
+    """By `vlc-rx decode` in a process of its own: what a user waits for, start-up included."""
+    paths = [path for path in case.source if isinstance(path, Path)]
+    command = [sys.executable, "-P", "-m", "rxcli.cli.main", *arguments_of(paths, case.options)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, check=False)
+    yield from (from_record(json.loads(line)) for line in done.stdout.splitlines())
+
+
 RECEIVER, OTHER_KERNEL = "receiver", "another kernel"
 #: Name of a way -> how it receives a case. `OTHER_KERNEL` is `RECEIVER` in another process.
 WAYS: dict[str, Way] = {
@@ -135,6 +147,7 @@ WAYS: dict[str, Way] = {
     **{f"no skip of {name}": _with_options(skip=frozenset(SKIPS) - {name}) for name in SKIPS},
     "no skip at all": _with_options(skip=frozenset()),
     "two threads": _on_two_threads,
+    "command": _by_command,
     "grey levels": lambda case: case.receive(case.options, with_grey_levels),
     "bound": lambda case: map(bound_result, case.trials),
     "paper": lambda case: map(paper_result, case.trials),
@@ -155,6 +168,12 @@ def threads(n: int) -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
+def _cpu_s() -> float:
+    """Processor time of this process and of those that it started and that have ended."""
+    children = os.times()
+    return process_time() + children.children_user + children.children_system
+
+
 def received(case: Case, way: str) -> Record:
     """Receive a case in one of the ways; the record of it, as JSON values.
 
@@ -167,14 +186,14 @@ def received(case: Case, way: str) -> Record:
     scorer = None if case.truth is None else Scorer(case.truth)
     results: list[FrameResult] = []
     problems: list[str] = []
-    start, wall = process_time(), perf_counter()
+    start, wall = _cpu_s(), perf_counter()
     with threads(1), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
             results.extend(result if scorer is None else scorer.add(result) for result in WAYS[way](case))
         except Exception as error:
             problems.append(f"{type(error).__name__}: {error}")
-    cpu_s, wall_s = process_time() - start, perf_counter() - wall
+    cpu_s, wall_s = _cpu_s() - start, perf_counter() - wall
     problems += [f"{w.category.__name__}: {w.message} ({Path(w.filename).name}:{w.lineno})" for w in caught]
     problems += [problem for result in results for problem in nonsense(result)]
     stages_ms = sum((Counter(result.timing_ms) for result in results), Counter[str]())

@@ -182,6 +182,7 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     # The genie decides whatever it sees, sure or not.
     "false": lambda g: None if g.way == "bound" or not g.scores else g.score.false,
     "packets": lambda g: len(g.packets),
+    "packets_each": lambda g: len(g.packets) / len(g.cases),
     "right_packets": lambda g: sum(packet["bit_errors"] == 0 for packet in g.packets),
     "same": lambda g: sum(r.get("difference") is None for r in g.receptions),
     "cpu_ratio": lambda g: sum(g.values("cpu_s")) / sum(Group(g.cases, g.reference, g.reference).values("cpu_s")),

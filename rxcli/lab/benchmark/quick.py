@@ -15,7 +15,7 @@ from rxcli.lab.benchmark.cases import Record
 from rxcli.lab.benchmark.measures import MEASURES, Group, Row
 from rxcli.lab.benchmark.runner import CHECKOUT, Run, scenarios
 
-_MEDIA = ("jpeg-26mp", "raw-26mp", "jpeg-26mp-hard", "jpeg-12mp-unknown")
+_MEDIA = ("body 26 MP", "RAW 26 MP", "body 26 MP, little light", "phone 12 MP")
 #: Runs of each medium, and small random scenes.
 _REPEATS, _SCENES = 3, 20
 #: Column of a table -> way and measure.
