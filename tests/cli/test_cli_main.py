@@ -58,7 +58,7 @@ def test_one_photo_loads_only_what_it_needs() -> None:
     """Half of its time is the loading of packages."""
     loaded = loaded_by("decode", str(Path(__file__).resolve().parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"))
     assert "rxcli.receiver.receive" in loaded
-    assert not loaded & {"tqdm", "email", "scipy", "av", "rawpy", "skimage", "tifffile", "threadpoolctl"}
+    assert not loaded & {"tqdm", "email", "scipy", "av", "rawpy", "skimage", "tifffile", "threadpoolctl", "PIL"}
     assert not loaded & {"rxcli.receiver.clip", "rxcli.runs.provenance", "logging.handlers", "concurrent.futures"}
 
 

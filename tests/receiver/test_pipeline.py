@@ -154,8 +154,7 @@ def test_raw_mosaic() -> None:
     assert (score.false, score.wrong_w) == (0, 0)
 
 
-@pytest.mark.parametrize("factor", [3, 10])
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(("factor", "known"), [(3, True), (10, False)])
 def test_a_wrongly_stated_exposure_is_estimated_and_the_difference_is_said(factor: float, known: bool) -> None:
     taken = clean()
     frame, options = frame_of(taken), options_for(taken)

@@ -16,6 +16,8 @@ from rxcli.types import Frame
 
 MAX_HINTS, MAX_STEPS = 3, 12
 GOOD = replace(preset("video-1080p", "paper-17k3"), n_frames=1)
+#: Of half the size at half the slot rate, which is received in a quarter of the time.
+SMALL = replace(preset("video-1080p", "paper-8k65").scaled(0.5, keep_readout=True), n_frames=1)
 
 
 def _posed(scene: Scene, **pose: float) -> Scene:
@@ -31,10 +33,10 @@ FOLLOWED: dict[str, Callable[[Scene], Scene]] = {
     "level": lambda scene: _posed(scene, roll_deg=0.4 * scene.pose.roll_deg),
 }
 STARTS = {
-    "far away": _posed(GOOD, fill=0.3),
+    "far away": _posed(SMALL, fill=0.3),
     "in portrait": _posed(GOOD, fill=0.5, roll_deg=88),
-    "a long exposure": replace(GOOD, exposure_s=GOOD.exposure_s * 32),
-    "dark, far and in portrait": _posed(GOOD, fill=0.35, roll_deg=92).exposed(GOOD.exposure_s, 1 / 100),
+    "a long exposure": replace(SMALL, exposure_s=SMALL.exposure_s * 16),
+    "dark, far and in portrait": _posed(SMALL, fill=0.35, roll_deg=92).exposed(SMALL.exposure_s, 1 / 100),
 }
 
 

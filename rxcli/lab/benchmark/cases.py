@@ -169,7 +169,7 @@ def threads(n: int) -> Iterator[None]:
 
 
 def _cpu_s() -> float:
-    """Processor time of this process and of those that it started and that have ended."""
+    """Processor time of this process and of its children that have ended."""
     children = os.times()
     return process_time() + children.children_user + children.children_system
 
