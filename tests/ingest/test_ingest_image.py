@@ -192,3 +192,19 @@ def test_exif_whose_second_directory_has_no_pointer_after_it_is_read() -> None:
     found = exif_metadata(exif)
     assert found.orientation == 3
     assert found.exposure_s == pytest.approx(1 / 24000)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "exposure_s"),
+    [
+        (5, struct.pack("<II", 1, 24000), 1 / 24000),
+        (5, struct.pack("<II", 1, 0), None),
+        (10, struct.pack("<ii", 1, 500), 1 / 500),
+        (12, struct.pack("<d", 0.002), 0.002),
+        (5, b"\1\0", None),
+    ],
+)
+def test_exposures_of_every_type_of_number(kind: int, value: bytes, exposure_s: float | None) -> None:
+    """Fractions, signed ones too, floats; what is infinite or cut is unknown."""
+    exif = b"II*\0\x08\0\0\0" + struct.pack("<HHHIII", 1, 0x829A, kind, 1, 26, 0) + value
+    assert exif_metadata(exif).exposure_s == exposure_s
