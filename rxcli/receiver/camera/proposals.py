@@ -67,7 +67,7 @@ def propose(
     exposures = {length: (exposure_s or 0.0) * rate for length, rate in rates.items()}
     coarse = joined(strips, max(1, int(width / SETTINGS.rows_per_width)))
     window = round(SETTINGS.level_widths * width / coarse.pitch)
-    level, weight = levelled(coarse.light, coarse.inside, window, coarse.noise)
+    level, weight = levelled(coarse.light, coarse.inside, window)
     level *= weight
     bends = [np.zeros(4)] + ([likeliest_bend(coarse, level)] if may_bend else [])
     found = [clock for bend in bends for clock in _clocks(coarse, level, bend, width, exposures)]
@@ -91,15 +91,17 @@ def _distinct(first: list[CameraHypothesis], found: list[CameraHypothesis]) -> l
 
 
 def stripe_rows(strips: ColumnStrips) -> float:
-    """Rows of the lag at which columns are half as like themselves as a row later; 0 where there are no stripes.
+    """Rows of the lag at which strips are half as like their neighbours as a row later; 0 where there are no stripes.
 
-    Texture that is wider than the stripes counts as well, so that levels follow what was found.
+    Neighbours have no noise in common. Texture that is wider than the stripes counts as well, so that levels follow
+    what was found.
     """
     width = float(SETTINGS.first_width_rows)
     for _ in range(SETTINGS.width_rounds):
         window = round(SETTINGS.level_widths * width)
-        level, weight = levelled(strips.light, strips.inside, window, strips.noise)
-        width = _half_width(_autocorrelation(columns_of(level * weight, strips.n_columns)))
+        level, weight = levelled(strips.light, strips.inside, window)
+        level *= weight
+        width = _half_width(_autocorrelation(level[:-1], level[1:]))
         if width <= 0:
             break
     return width
@@ -307,12 +309,13 @@ def _blurred(values: Float32Array, n: int) -> Float32Array:
     return np.asarray(cv2.blur(np.ascontiguousarray(values), (min(n, 2 * values.shape[1] - 1) | 1, 1)))
 
 
-def _autocorrelation(columns: Float32Array) -> FloatArray:
-    """(R,) sum over columns (C, R) of the product with the same column later."""
+def _autocorrelation(columns: Float32Array, later: Float32Array | None = None) -> FloatArray:
+    """(R,) sum over columns (C, R) of the product with the same columns later, or with others."""
     n = columns.shape[1]
     size = 1 << int(np.ceil(np.log2(2 * n)))
     spectrum = np.fft.rfft(columns, size, axis=1)
-    return np.asarray(np.fft.irfft((spectrum * spectrum.conj()).real.sum(axis=0), size)[:n])
+    others = spectrum if later is None else np.fft.rfft(later, size, axis=1)
+    return np.asarray(np.fft.irfft((spectrum * others.conj()).real.sum(axis=0), size)[:n])
 
 
 def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:

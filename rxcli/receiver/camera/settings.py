@@ -21,8 +21,8 @@ class EstimateSettings:
     #: Half width of the columns' autocorrelation before anything is known, rows; and rounds of estimating it.
     first_width_rows: int = 4
     width_rounds: int = 3
-    #: Window of the levels, in half widths of the columns' autocorrelation.
-    level_widths: float = 16.0
+    #: Window of the levels, in half widths of the stripes.
+    level_widths: float = 14.0
     #: Rows that a half width keeps when rows are joined.
     rows_per_width: float = 4.0
     #: Half width of the autocorrelation, slots: from the shortest exposures to those of three slots.

@@ -86,29 +86,31 @@ def joined(strips: ColumnStrips, n: int) -> ColumnStrips:
     )
 
 
-def levelled(
-    light: Float32Array, inside: Float32Array, window: int, noise: NoiseModel
-) -> tuple[Float32Array, Float32Array]:
-    """Light (M, R) against mean and spread of the `window` rows around it; and the weight behind it, 0..1."""
+def levelled(light: Float32Array, inside: Float32Array, window: int) -> tuple[Float32Array, Float32Array]:
+    """Light (M, R) against mean and spread of the `window` rows around it; and the weight behind it, 0..1.
+
+    What a strip has in common with its neighbours is the columns' light; the rest is noise and picture.
+    """
     import cv2
 
     # Periods of a row or two leave no window; the smallest one is no use, but no error.
     size = (max(window, 1) | 1, 1)
     share = np.maximum(cv2.blur(inside, size), np.float32(1 / size[0]))
-    mean = cv2.blur(light, size) / share
-    random = noise.variance(mean) + np.float32(SETTINGS.min_variance)
-    signal = np.maximum(cv2.blur(light * light, size) / share - mean * mean - random, 0)
+    change = (light - cv2.blur(light, size) / share) * inside
+    beside = np.pad(change, ((1, 1), (0, 0)), mode="reflect")
+    power, shared = (cv2.blur(change * other, size) / share for other in (change, (beside[:-2] + beside[2:]) / 2))
+    signal = np.clip(shared, 0, power)
     sigmas = np.float32(SETTINGS.bounded_sigmas)
-    doubt = signal + sigmas * sigmas * random
-    level = np.clip((light - mean) / np.sqrt(doubt), -sigmas, sigmas) * inside
+    doubt = signal + sigmas * sigmas * (power - signal) + np.float32(SETTINGS.min_variance)
+    level = np.clip(change / np.sqrt(doubt), -sigmas, sigmas)
     return level, signal / doubt * inside
 
 
 def columns_of(level: Float32Array, n_columns: int) -> Float32Array:
     """(C, R) -1 dark to 1 lit: soft sign of the columns, from the levelled light of their strips (M, R).
 
-    Each column is bounded by half of its own root mean square.
+    Columns are bounded by half of their common root mean square: those without light stay small.
     """
     mean = level.reshape(n_columns, -1, level.shape[1]).mean(axis=1)
-    rms = np.sqrt(np.square(mean).mean(axis=1, keepdims=True))
-    return np.asarray(np.clip(2 * mean / (rms + np.float32(SETTINGS.min_soft_sign)), -1, 1), np.float32)
+    rms = np.sqrt(np.square(mean).mean()) + np.float32(SETTINGS.min_soft_sign)
+    return np.asarray(np.clip(2 * mean / rms, -1, 1), np.float32)

@@ -21,6 +21,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile, parse_profile, usual_screens
 from rxcli.receiver import camera as blind
 from rxcli.receiver import plane
+from rxcli.receiver.camera.proposals import stripe_rows
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.light import NoiseModel
 from rxcli.receiver.receive import receive
@@ -276,3 +277,15 @@ def test_captures_of_unknown_cameras_decode(
     )
     assert right >= floor - (3 if scale != 1.0 else 0)
     assert sent == len(result.columns)
+
+
+def test_dark_columns_do_not_hide_the_width_of_the_stripes() -> None:
+    """A night picture: two columns are lit, the others show a developed picture's noise that no model foretells."""
+    rng, rows_per_slot, n_rows = np.random.default_rng(5), 14, 1400
+    light = cv2.blur(rng.normal(0.01, 4e-3, (40, n_rows)), (3, 1)).astype(np.float32)
+    light[20:24] += 0.1 * rng.integers(0, 2, (2, n_rows // rows_per_slot)).repeat(2, axis=0).repeat(
+        rows_per_slot, axis=1
+    )
+    places = np.zeros((40, n_rows)), np.arange(float(n_rows))
+    strips = blind.ColumnStrips(light, np.ones_like(light), *places, 20, NoiseModel(1e-9, 1e-9), 4000, n_rows)
+    assert 0.4 < stripe_rows(strips) / rows_per_slot < 1
