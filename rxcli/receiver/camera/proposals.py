@@ -91,7 +91,7 @@ def _distinct(first: list[CameraHypothesis], found: list[CameraHypothesis]) -> l
 
 
 def stripe_rows(strips: ColumnStrips) -> float:
-    """Rows of the lag at which strips are half as like their neighbours as a row later; 0 where there are no stripes.
+    """Rows of the lag at which strips are half as like the one beside as a row later; 0 where there are no stripes.
 
     Neighbours have no noise in common. Texture that is wider than the stripes counts as well, so that levels follow
     what was found.
@@ -101,7 +101,7 @@ def stripe_rows(strips: ColumnStrips) -> float:
         window = round(SETTINGS.level_widths * width)
         level, weight = levelled(strips.light, strips.inside, window)
         level *= weight
-        width = _half_width(_autocorrelation(level[:-1], level[1:]))
+        width = _half_width(_autocorrelation(level[:-1:2], level[1::2]))
         if width <= 0:
             break
     return width

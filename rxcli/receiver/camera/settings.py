@@ -22,7 +22,7 @@ class EstimateSettings:
     first_width_rows: int = 4
     width_rounds: int = 3
     #: Window of the levels, in half widths of the stripes.
-    level_widths: float = 14.0
+    level_widths: float = 16.0
     #: Rows that a half width keeps when rows are joined.
     rows_per_width: float = 4.0
     #: Half width of the autocorrelation, slots: from the shortest exposures to those of three slots.

@@ -89,7 +89,7 @@ def joined(strips: ColumnStrips, n: int) -> ColumnStrips:
 def levelled(light: Float32Array, inside: Float32Array, window: int) -> tuple[Float32Array, Float32Array]:
     """Light (M, R) against mean and spread of the `window` rows around it; and the weight behind it, 0..1.
 
-    What a strip has in common with its neighbours is the columns' light; the rest is noise and picture.
+    What a strip has in common with a neighbour is the columns' light; the rest is noise and picture.
     """
     import cv2
 
@@ -98,8 +98,8 @@ def levelled(light: Float32Array, inside: Float32Array, window: int) -> tuple[Fl
     share = np.maximum(cv2.blur(inside, size), np.float32(1 / size[0]))
     change = (light - cv2.blur(light, size) / share) * inside
     beside = np.pad(change, ((1, 1), (0, 0)), mode="reflect")
-    power, shared = (cv2.blur(change * other, size) / share for other in (change, (beside[:-2] + beside[2:]) / 2))
-    signal = np.clip(shared, 0, power)
+    power, left, right = (cv2.blur(change * other, size) / share for other in (change, beside[:-2], beside[2:]))
+    signal = np.clip(np.maximum(left, right), 0, power)
     sigmas = np.float32(SETTINGS.bounded_sigmas)
     doubt = signal + sigmas * sigmas * (power - signal) + np.float32(SETTINGS.min_variance)
     level = np.clip(change / np.sqrt(doubt), -sigmas, sigmas)
