@@ -24,6 +24,7 @@ from rxcli.receiver.plane import in_one_mix
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.attempts import receive_either_way
+from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.outlines import no_screen, proposed_screens, too_small
 from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
@@ -130,7 +131,14 @@ def _receive_screen(
         reception, denoised, report = apply_autoencoder(acquisition, reception, options)
     # Packets, with the probability that they are right.
     columns = assemble.column_results(
-        assemble.FrameColumns(reception.clock, reception.snr, no_header, options.min_confidence, outline.certainty),
+        assemble.FrameColumns(
+            reception.clock,
+            reception.snr,
+            no_header,
+            options.min_confidence,
+            outline.certainty,
+            framing_of(acquisition, reception, found.screens).bursts,
+        ),
         reception.posteriors,
         reception.n_observed,
         reception.confidence_features(reception.posteriors, denoised),

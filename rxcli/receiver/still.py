@@ -89,12 +89,12 @@ def initial_pass(acquisition: Acquisition) -> Reception:
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
     metrics = channel.initial_metrics(*contrast, model.exposure)
     clock = _in_bursts(acquisition, clock, metrics)
-    lit = clock.on_grid(_detect(metrics, clock, weight_margin=0.0).lit)
+    lit = clock.on_grid(detected(metrics, clock, weight_margin=0.0).lit)
     columns = np.arange(samples.light.shape[0])
     likelihoods = channel.slot_likelihoods(samples, clock, model, lit, columns, is_initial=True)
     clock = _in_bursts(acquisition, clock, likelihoods.metrics)
     clock = sync.corrected(clock, likelihoods.timing)
-    posteriors = _detect(likelihoods.metrics, clock)
+    posteriors = detected(likelihoods.metrics, clock)
     joint = np.zeros(columns.size, bool)
     return Reception(clock, samples, contrast, posteriors, likelihoods.snr, model, likelihoods.metrics, joint)
 
@@ -204,14 +204,14 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
     light = reception.samples.light[reception.samples.valid > 0]
     levels = [float(np.percentile(light, STILL.dark_percent)) * share for share in STILL.dark_shares]
     level = levels[int(evidence(clock, levels).sum(axis=1).argmax())]
-    ways = [way for way, _ in sync.possible_bursts(clock, slot_llr(reception.metrics), acquisition.repeats)]
+    ways = [way for way, _, _ in sync.possible_bursts(clock, slot_llr(reception.metrics), acquisition.repeats)]
     gains = np.concatenate([evidence(way, [level]) for way in ways])
     most = STILL.max_column_gain
     best = ways[int(np.clip(gains - gains[0], -most, most).sum(axis=1).argmax())]
     refined = replace(reception, clock=best, model=replace(reception.model, black_level=level))
     if np.array_equal(best.burst, reception.clock.burst):
         return refined
-    posteriors = _detect(reception.metrics, best)
+    posteriors = detected(reception.metrics, best)
     header_llr = np.repeat(reception.posteriors.header_llr[:1], len(posteriors.header_llr), axis=0)
     log_evidence = reception.posteriors.log_evidence
     return replace(refined, posteriors=replace(posteriors, header_llr=header_llr, log_evidence=log_evidence))
@@ -231,10 +231,12 @@ def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[
     """
     if reception.free_log_evidence is not None:
         return
-    (_, similarity), *rivals = sync.possible_bursts(reception.clock, slot_llr(reception.metrics), acquisition.repeats)
-    for clock, rival_similarity in rivals:
+    (_, similarity, _), *rivals = sync.possible_bursts(
+        reception.clock, slot_llr(reception.metrics), acquisition.repeats
+    )
+    for clock, rival_similarity, _ in rivals:
         if similarity - rival_similarity <= SETTINGS.plain_bursts or not reception.is_complete.any():
-            rival = replace(reception, clock=clock, posteriors=_detect(reception.metrics, clock))
+            rival = replace(reception, clock=clock, posteriors=detected(reception.metrics, clock))
             yield rival, similarity - rival_similarity
 
 
@@ -242,7 +244,7 @@ def as_one_column(reception: Reception) -> Reception:
     """Receive all columns as one that sends the same."""
     middle = reception.of_columns(np.array([reception.snr.shape[0] // 2]))
     metrics = reception.metrics.sum(axis=0, keepdims=True)
-    return replace(middle, metrics=metrics, posteriors=_detect(metrics, middle.clock))
+    return replace(middle, metrics=metrics, posteriors=detected(metrics, middle.clock))
 
 
 def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
@@ -269,7 +271,7 @@ def _with_metrics(
     """Replace the metrics of some columns and detect their words again."""
     of_all, snr_of_all = reception.metrics.copy(), reception.snr.copy()
     of_all[columns], snr_of_all[columns] = metrics, snr
-    posteriors = reception.posteriors.with_columns(columns, _detect(metrics, reception.clock))
+    posteriors = reception.posteriors.with_columns(columns, detected(metrics, reception.clock))
     joint = reception.joint.copy()
     joint[columns] = False
     return replace(reception, metrics=of_all, snr=snr_of_all, posteriors=posteriors, joint=joint)
@@ -351,7 +353,8 @@ def _in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> C
     return sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)[0][0]
 
 
-def _detect(metrics: FloatArray, clock: Clock, weight_margin: float = SETTINGS.weight_margin) -> BurstPosteriors:
+def detected(metrics: FloatArray, clock: Clock, weight_margin: float = SETTINGS.weight_margin) -> BurstPosteriors:
+    """Detect the packets of a clock from metrics (C, N + memory, patterns) of the grid."""
     bursts = channel.by_burst(metrics, clock)
     return detect.detect(bursts, detect.plausible_weights(bursts, weight_margin))
 

@@ -317,7 +317,7 @@ def test_a_common_clock_that_does_not_fit_a_frame_is_dropped(monkeypatch: pytest
         screen = context.screens[0]
         time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
         time.begin(frames[0].index, frames[0].time_s, 5.0, screen.slot_rate_hz / 120)
-        return [Start(screen, (screen,), time, 2.0)]
+        return [Start(screen, (screen,), time, 2.0, 0.0)]
 
     monkeypatch.setattr("rxcli.receiver.clip.acquiring.shows_little", lambda _: True)
     monkeypatch.setattr("rxcli.receiver.clip.common_clock._starts", wrong)

@@ -68,9 +68,12 @@ def simulate(
     height: float = 0.94,
     repeats: int = 3,
     frame_rate_hz: float = 60000 / 1001,
+    screen: str = "paper-8k65",
+    readout_s: float | None = None,
 ) -> Clip:
     """Nearly the whole height is screen: a frame shows 1.5 packets, so that bursts fall into two or three frames."""
-    scene = preset("video-1080p", "paper-8k65").scaled(0.32, 0.5, keep_readout=True)
+    scene = preset("video-1080p", screen)
+    scene = (scene if readout_s is None else scene.read_in(readout_s)).scaled(0.32, 0.5, keep_readout=True)
     left, right, n_rows = 20.0, scene.sensor.width - 22.0, scene.sensor.height
     top, bottom = n_rows * (1 - height) / 2, n_rows * (1 + height) / 2
     corners = ((left, top), (right, top + 3), (right - 2, bottom), (left + 3, bottom - 2))

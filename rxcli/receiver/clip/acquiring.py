@@ -46,8 +46,8 @@ class FirstFrames:
 
     @property
     def shows_little(self) -> bool:
-        """Whether each shows too few packets to find its clock alone."""
-        return shows_little(self.located.context)
+        """Whether each shows too few packets to find its clock alone, or leaves their length open."""
+        return shows_little(self.located.context) or self.located.framing < SETTINGS.sure_framing
 
     @property
     def are_enough(self) -> bool:

@@ -29,6 +29,8 @@ class Burst:
     #: (C, packet) number of observations of each slot.
     n_observed: IntArray
     frames: tuple[int, ...]
+    #: Numbers of the copies whose payload they show.
+    copies: IntArray
     #: Whether the picture was known from other frames in any of them.
     tracked: bool
 
@@ -38,6 +40,7 @@ class Burst:
             self.metrics + burst.metrics,
             self.n_observed + burst.n_observed,
             self.frames + burst.frames,
+            np.union1d(self.copies, burst.copies),
             self.tracked or burst.tracked,
         )
 
@@ -82,11 +85,13 @@ def bursts_of(view: View) -> list[Burst]:
     """What a frame shows of its bursts."""
     assert view.numbers is not None
     own = view.bursts
-    metrics = channel.by_burst(own.metrics, own.clock)
-    return [
-        Burst(number, metrics[index], own.shown[own.clock.burst == index].sum(axis=0), (own.frame,), own.tracked)
-        for index, number in enumerate(view.numbers.tolist())
-    ]
+    metrics, shows_payload = channel.by_burst(own.metrics, own.clock), own.shown[..., PREAMBLE_SLOTS:].any(axis=(1, 2))
+    bursts = []
+    for index, number in enumerate(view.numbers.tolist()):
+        which = own.clock.burst == index
+        copies = own.first_copy + np.flatnonzero(which & shows_payload)
+        bursts.append(Burst(number, metrics[index], own.shown[which].sum(axis=0), (own.frame,), copies, own.tracked))
+    return bursts
 
 
 def lit_slots(view: View, bursts: Sequence[Burst]) -> Float32Array:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.options import ReceiverOptions
+from rxcli.profiles import ScreenProfile
 from rxcli.receiver.clip.common_clock import Start, acquisition_at
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.acquisition import Acquisition
@@ -16,6 +17,7 @@ from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, search
+from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.settings import SETTINGS as search_settings
 from rxcli.receiver.still import initial_pass
 from rxcli.types import FloatArray, Frame
@@ -34,6 +36,8 @@ class Located:
     context: FrameContext
     #: None where the screen was moved since, or the camera is that of another frame.
     found: Found | Failure | None
+    #: Probability of the length of packets, by the frame that showed the camera.
+    framing: float = 1.0
 
     @property
     def camera_error(self) -> float:
@@ -50,7 +54,9 @@ class Located:
 
     def moved_to(self, corners: FloatArray) -> Located:
         """The same with the screen at the corners (4, 2)."""
-        return Located(replace(self.outline, corners=corners), replace(self.context, sampled_corners=corners), None)
+        return Located(
+            replace(self.outline, corners=corners), replace(self.context, sampled_corners=corners), None, self.framing
+        )
 
     def with_surer_camera(self, located: Located | Failure) -> Located:
         """The same with the camera of another frame, if that camera is more precise."""
@@ -58,7 +64,7 @@ class Located:
             return self
         own = self.context
         context = replace(located.context, cache=own.cache, sampled_corners=own.sampled_corners)
-        return Located(self.outline, context, None)
+        return Located(self.outline, context, None, located.framing)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +74,8 @@ class Acquired:
     context: FrameContext
     acquisition: Acquisition
     initial: Reception
+    #: All screens that the camera may have seen.
+    screens: tuple[ScreenProfile, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,7 +104,11 @@ class ClipCamera:
         if found.outline is None or context is None:
             assert isinstance(found, Failure)
             return found
-        return Located(found.outline, replace(context, cache=cache, sampled_corners=found.outline.corners), found)
+        framing = 1.0
+        if isinstance(found, Found):
+            framing = framing_of(found.best.acquisition, found.best.reception, found.screens).length
+        context = replace(context, cache=cache, sampled_corners=found.outline.corners)
+        return Located(found.outline, context, found, framing)
 
     def acquire(
         self, located: Located, start: Start | None, cache: FrameCache
@@ -113,7 +125,7 @@ class ClipCamera:
         camera = replace(self, context=context)
         predicted = None if start is None else acquisition_at(start, context)
         if predicted is not None:
-            return camera, Acquired(context, predicted, initial_pass(predicted))
+            return camera, Acquired(context, predicted, initial_pass(predicted), self.options.screens)
         # Of the camera's lens, and in no need of refinement.
         outline = replace(located.outline, corners=corners, strips=None, grid=None)
         found = located.found or search(cache, self.options, context, outlines=[outline])
@@ -125,7 +137,7 @@ class ClipCamera:
         if best.context.camera.hypothesis is not None:
             context = replace(best.context, cache=cache, camera=replace(best.context.camera, hypothesis=None))
         context = replace(context, sampled_corners=best.context.sampled_corners)
-        return replace(camera, context=context), Acquired(context, best.acquisition, best.reception)
+        return replace(camera, context=context), Acquired(context, best.acquisition, best.reception, found.screens)
 
     def _compared(self, found: Found, outline: Outline) -> tuple[ClipCamera, Found]:
         """Estimate the camera of a clip's first frame where that of the profile explains little of it.

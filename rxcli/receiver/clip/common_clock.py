@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.numerics import folded
+from rxcli.numerics import NORMAL_MEDIAN, TINY, folded
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.acquisition import Acquisition, distinct_screens, noise_of, variants_of
@@ -33,6 +33,9 @@ class Start:
     time: LinkTime
     #: How much likelier the headers' place is than the best elsewhere.
     lead: float
+    #: Log-likelihood of headers there, against none; and probability of this length among those that were compared.
+    log_evidence: float
+    certainty: float = 1.0
 
 
 def shows_little(context: FrameContext) -> bool:
@@ -53,10 +56,15 @@ def common_clock(
         context: of the first of them.
         screens: that an estimated camera may have seen.
     """
-    found = ((start, at) for at in _possible_contexts(frames, context, screens) for start in _starts(frames, at))
-    return max(
-        (each for each in found if each[0].lead > SETTINGS.min_lead), key=lambda each: each[0].lead, default=None
-    )
+    found = [(start, at) for at in _possible_contexts(frames, context, screens) for start in _starts(frames, at)]
+    start, at = max(found, key=lambda each: each[0].log_evidence)
+    if start.lead <= SETTINGS.min_lead:
+        return None
+    # Screens that differ in their columns alone share a clock.
+    rivals = {(each.screen.slot_rate_hz, each.screen.packet_slots): each.log_evidence for each, _ in found}
+    rivals[start.screen.slot_rate_hz, start.screen.packet_slots] = start.log_evidence
+    certainty = 1 / np.exp(np.array(list(rivals.values())) - start.log_evidence).sum()
+    return replace(start, certainty=float(certainty)), at
 
 
 def _possible_contexts(
@@ -92,23 +100,31 @@ def _starts(frames: Sequence[Frame], context: FrameContext) -> Iterator[Start]:
         each = (replace(context, cache=FrameCache(frame, context.timer)) for frame in frames)
         profiles = [of_frame.sample_columns(screen.columns) for of_frame in each]
         joined = _one_after_the_other(profiles, starts, screen.packet_s / line_delay_s)
-        slot, lead = _first_header(joined, screen, 1 / (screen.slot_rate_hz * line_delay_s))
+        slot, lead, log_evidence = _first_header(joined, screen, 1 / (screen.slot_rate_hz * line_delay_s))
         time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
         time.begin(frames[0].index, frames[0].time_s, -slot, period_s * screen.slot_rate_hz)
-        yield Start(screen, variants_of(screen, context.screens), time, lead)
+        yield Start(screen, variants_of(screen, context.screens), time, lead, log_evidence)
 
 
-def _first_header(profiles: RowProfiles, screen: ScreenProfile, rows_per_slot: float) -> tuple[float, float]:
-    """Slots from sensor row 0 to the first header, and how much likelier that place is than the best elsewhere."""
+def _first_header(profiles: RowProfiles, screen: ScreenProfile, rows_per_slot: float) -> tuple[float, float, float]:
+    """Slots from sensor row 0 to the first header, how much likelier that place is, and the log-likelihood of headers.
+
+    Payloads of many columns add up to noise, against which every header that is in view counts.
+    """
     q, top = sync_settings.search_samples, float(profiles.rows[0]) - 0.5
     step = rows_per_slot / q
     light, valid = sync.resample(profiles, top, step, int(profiles.rows.size / step))
     pooled, weight = sync.search_contrast(light, valid, noise_of(profiles) / np.sqrt(max(step, 1.0)))
     response = sync.header_response(pooled, weight, q).mean(axis=0)
-    power = folded(np.maximum(response, 0) ** 2, screen.packet_slots * q)
+    shown = response[response != 0]
+    noise = np.square(np.median(np.abs(shown)) / NORMAL_MEDIAN) + TINY if shown.size else 1.0
+    power = folded(np.maximum(response, 0) ** 2 / (2 * noise), screen.packet_slots * q)
     # Time stamps are rounded to milliseconds: neighbouring places are equivalent.
-    place, lead = sync.header_comb((power + np.roll(power, 1) + np.roll(power, -1)) / 3, q)
-    return top / rows_per_slot + place / q, lead
+    near = (power + np.roll(power, 1) + np.roll(power, -1)) / 3
+    place, lead = sync.header_comb(near, q)
+    best = float(near.max())
+    log_evidence = best + float(np.log(np.exp(near - best).sum() / near.size))
+    return top / rows_per_slot + place / q, lead, log_evidence
 
 
 def _one_after_the_other(profiles: Sequence[RowProfiles], starts: FloatArray, packet_rows: float) -> RowProfiles:

@@ -122,7 +122,7 @@ class Ledger:
             self.start, timeline = None, Timeline.begin(view, None, stretch)
             timeline.place(view)
         self._bursts = {}
-        return timeline if before is None else timeline.after(before, view.context.frame)
+        return timeline if before is None else timeline.after(before, view)
 
     def _enter_stretched(self, stretch: float | None) -> list[FrameResult]:
         """Enter all frames anew by another ratio of their time stamps; returns the results that are complete."""

@@ -26,6 +26,7 @@ from rxcli.receiver.decode import assemble
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.passes import Reception, shows_steady_light
 from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode
 from rxcli.receiver.sync import tracking
@@ -250,6 +251,7 @@ def _receive_anew(
         frame.height,
         reception.snr,
         denoised,
+        framing=framing_of(acquisition, acquired.initial, acquired.screens),
     )
     if not _can_track(acquired, options):
         return Lost(known), view, report

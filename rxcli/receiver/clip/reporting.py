@@ -41,9 +41,14 @@ class Reporter:
         result, view = waiting.result, waiting.view
         assert view is not None
         ended = [burst.ended(view) for burst in closed]
+        framing = np.ones(view.bursts.clock.n_copies)
+        for burst, end in zip(closed, ended, strict=True):
+            framing[end.index] = timeline.certainty(burst.copies)
         headerless = timeline.headerless(ended, len(view.snr))
         columns = assemble.clip_results(
-            assemble.FrameColumns(view.bursts.clock, view.snr, headerless, self.options.min_confidence, certainty),
+            assemble.FrameColumns(
+                view.bursts.clock, view.snr, headerless, self.options.min_confidence, certainty, framing
+            ),
             ended,
             lambda column: any(burst.probability(column) >= BELIEVABLE for burst in going_on),
         )

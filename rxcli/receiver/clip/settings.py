@@ -69,6 +69,10 @@ class ClipSettings:
 
     #: A frame that shows fewer packets than this finds its clock with others; one that shows more does better alone.
     few_packets: float = 1.05
+    #: Probability of the length of packets from which a frame's clock needs no other frames.
+    sure_framing: float = 0.99
+    #: Share of frames whose clock contradicts the link's time although that is right.
+    wrong_clocks: float = 0.05
     #: Lead of the headers' place over the best elsewhere.
     min_lead: float = 1.4
 

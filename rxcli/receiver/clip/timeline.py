@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.receiver.clip.common_clock import Start
+from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View
 from rxcli.receiver.decode import assemble, confidence
 from rxcli.receiver.decode.settings import SETTINGS as decode_settings
 from rxcli.receiver.light import slot_llr
+from rxcli.receiver.search.framing import log_odds
 from rxcli.receiver.sync import tracking
-from rxcli.types import BoolArray, FloatArray, Frame
+from rxcli.types import BoolArray, FloatArray, Frame, IntArray
 
 
 @dataclass(slots=True, eq=False)
@@ -30,6 +32,8 @@ class Timeline:
     #: Counts the starts of the link's time: burst numbers of different ones cannot be compared.
     epoch: int = 1
     last_time_s: float = 0.0
+    #: Log-odds that packets have this length.
+    length_log_odds: float = 0.0
     #: Whether time stamps were compared with the link's time.
     stamps_judged: bool = False
     #: (1, C) log-likelihood ratio of the headers of all bursts so far; a scalar 0 before any.
@@ -40,23 +44,37 @@ class Timeline:
         """Begin with a frame; its time is that of `start` if the first frames agreed on one."""
         screen = view.acquisition.screen
         time = start.time if start else tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
-        return cls(time, tracking.BurstPhase(view.acquisition.repeats), _shape(view), stamps_judged=stretch != 1)
+        phase = tracking.BurstPhase(view.acquisition.repeats)
+        prior = start.certainty if start else view.framing.prior if view.framing else 1.0
+        return cls(time, phase, _shape(view), length_log_odds=log_odds(prior), stamps_judged=stretch != 1)
 
-    def after(self, before: Timeline, frame: Frame) -> Timeline:
+    def after(self, before: Timeline, view: View) -> Timeline:
         """Count on from an earlier time, with the bursts that passed until a frame."""
-        passed_s = (frame.time_s - before.last_time_s) / self.time.stretch
+        passed_s = (view.context.frame.time_s - before.last_time_s) / self.time.stretch
         passed = int(passed_s * self.time.slot_rate_hz / (self.time.packet_slots * before.phase.repeats))
         offset = before.next_number + passed
-        return replace(self, offset=offset, next_number=offset, epoch=before.epoch + 1)
+        of_length = self.length_log_odds
+        if self.shape == before.shape:
+            of_length = before.length_log_odds + (view.framing.gain if view.framing else 0.0)
+        return replace(self, offset=offset, next_number=offset, epoch=before.epoch + 1, length_log_odds=of_length)
 
     def place(self, view: View) -> bool:
-        """Find the place of a frame's copies in the link's time; False where its clock contradicts it."""
+        """Find the place of a frame's copies in the link's time; False where its clock contradicts it.
+
+        By chance a clock of packets of another length agrees as often as it falls within the tolerance.
+        """
         if self.shape != _shape(view):
             return False
         frame, own = view.context.frame, view.bursts
+        by_chance = 2 * self.time.sure_slots / self.time.packet_slots if self.time.is_measured else None
         first_copy = self.time.update(frame.index, frame.time_s, own.clock)
+        if by_chance is not None:
+            wrong = SETTINGS.wrong_clocks
+            ratio = wrong / (1 - by_chance) if first_copy is None else (1 - wrong) / by_chance
+            self.length_log_odds += float(np.log(ratio))
         if first_copy is None:
             return False
+        self.length_log_odds += 0.0 if view.framing is None else view.framing.gain
         view.bursts, self.last_time_s = replace(own, first_copy=first_copy), frame.time_s
         if not self.phase.settled:
             copies = own.clock.to_copies(slot_llr(own.metrics)).transpose(1, 0, 2)
@@ -71,6 +89,10 @@ class Timeline:
         view.bursts = replace(view.bursts, clock=replace(clock, burst=bursts - numbers[0]))
         view.numbers = numbers + self.offset
         self.next_number = max(self.next_number, int(view.numbers[-1]) + 1)
+
+    def certainty(self, copies: IntArray) -> float:
+        """Probability that packets have this length and that some copies of it, by their numbers, are one packet."""
+        return self.phase.certainty(copies) / (1 + float(np.exp(-self.length_log_odds)))
 
     def predicted(self, frame: Frame, rows: FloatArray, rows_per_slot: float) -> list[int]:
         """Numbers of the bursts that the rows (R,) of a further frame should show; none if that is not known."""

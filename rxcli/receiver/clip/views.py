@@ -9,6 +9,7 @@ from rxcli.receiver.channel.known_picture import ColumnLight
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.plane import tracked
+from rxcli.receiver.search.framing import Framing
 from rxcli.receiver.sync.tracking import FrameBursts
 from rxcli.types import Float32Array, FloatArray, FrameResult, IntArray
 
@@ -50,6 +51,8 @@ class View:
     pose: Pose | None = None
     #: The columns' own light; None where the frame was received like a photograph.
     flat: ColumnLight | None = None
+    #: How sure the length of packets is by this frame alone; None where the picture was known.
+    framing: Framing | None = None
     #: (B,) numbers of the frame's bursts, once known.
     numbers: IntArray | None = None
 

@@ -48,6 +48,8 @@ class FrameColumns:
     min_confidence: float
     #: Probability that the columns' numbers are right.
     certainty: float = 1.0
+    #: (B,) probability that the slots of each burst are one packet; None: certain.
+    framing: FloatArray | None = None
 
     @cached_property
     def snr_db(self) -> list[float | None]:
@@ -74,7 +76,8 @@ def column_results(
     quality = still_quality(posteriors, confidence_features)
     shown = [_Shown(index, index, posteriors, observed) for index, observed in enumerate(n_observed)]
     bursts = [_burst(frame, burst, quality) for burst in shown]
-    sure = quality.confidence >= SETTINGS.min_best_confidence
+    framing = np.ones(len(n_observed)) if frame.framing is None else frame.framing
+    sure = framing[:, None] * quality.confidence >= SETTINGS.min_best_confidence
     if not any((burst.possible & ~frame.headerless)[sure[index]].any() for index, burst in enumerate(bursts)):
         # Light without data: an isolated packet is chance.
         bursts = [replace(burst, possible=np.zeros_like(burst.possible)) for burst in bursts]
@@ -134,14 +137,15 @@ def _burst(frame: FrameColumns, shown: _Shown, quality: Quality) -> _Burst:
     copies = n_observed.sum(axis=1) / clock.packet_slots
     rows = _header_rows(int((clock.burst == shown.index).argmax()), clock)
     payloads = _payloads(posteriors.index[place], posteriors.w)
+    framing = 1.0 if frame.framing is None else float(frame.framing[shown.index])
     packets = [
         PacketResult(
             first_row=first_row,
             copies=n_copies,
             payload_bits=bits_per_symbol(w) * posteriors.index.shape[2],
             payload=payload,
-            confidence=frame.certainty * confidence,
-            ber_hat=ber_hat,
+            confidence=frame.certainty * framing * confidence,
+            ber_hat=framing * ber_hat + (1 - framing) / 2,
             burst=shown.number,
             frames=shown.frames,
             confidence_features=tuple(features),

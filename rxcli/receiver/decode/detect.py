@@ -70,7 +70,7 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
         bit_llr[:, columns, :, : bits_per_symbol(w)] = llr_of_bits(posterior, bits_per_symbol(w))
     log_evidence = np.logaddexp.reduce(w_log_evidence, axis=1)
     weights, w_log_prob = w_log_evidence.argmax(axis=1) + 1, w_log_evidence - log_evidence[:, None]
-    return BurstPosteriors(weights, w_log_prob, log_evidence, lit, index, log_prob, bit_llr, _header_llr(metrics))
+    return BurstPosteriors(weights, w_log_prob, log_evidence, lit, index, log_prob, bit_llr, header_llr(metrics))
 
 
 def _isi_memory_of(metrics: FloatArray) -> int:
@@ -96,7 +96,7 @@ def llr_of_bits(posterior: FloatArray, k: int) -> FloatArray:
     return np.asarray(np.log(np.maximum(p_one, MIN_FLOAT32)) - np.log(np.maximum(p_zero, MIN_FLOAT32)))
 
 
-def _header_llr(metrics: FloatArray) -> FloatArray:
+def header_llr(metrics: FloatArray) -> FloatArray:
     """(B, C) log-likelihood ratio of the header's slots against arbitrary, equally likely slots."""
     isi_memory = _isi_memory_of(metrics)
     header = metrics[:, :, isi_memory : len(HEADER)]

@@ -86,3 +86,5 @@ class Found:
     #: The outline with the probability that its columns are numbered as the screen's.
     outline: Outline
     tried: tuple[Tried, ...]
+    #: All screens that the camera may have seen.
+    screens: tuple[ScreenProfile, ...]

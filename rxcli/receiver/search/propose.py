@@ -90,6 +90,11 @@ class Proposer:
     def _screens(self) -> tuple[ScreenProfile, ...]:
         return self.known.screens if self.known else self.options.screens
 
+    def possible_screens(self, best: Hypothesis) -> tuple[ScreenProfile, ...]:
+        """Screens that the camera of a hypothesis may have seen: an estimated one does not show the slot rate."""
+        is_estimated, rate = best.camera.profile is None, best.screen.slot_rate_hz
+        return tuple(screen for screen in self.options.screens if is_estimated or screen.slot_rate_hz == rate)
+
     def _hypothesis(self, outline: Outline, camera: FrameCamera, screen: ScreenProfile, log_prior: float) -> Hypothesis:
         variants = variants_of(screen, self.options.screens)
         camera = relabelled_camera(camera, screen, self.cache.frame)

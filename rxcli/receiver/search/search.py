@@ -103,7 +103,7 @@ def _search(
     if refused is not None:
         return replace(refused, outline=chosen, context=best.context, tried=walk.record(best, "no data"))
     chosen = replace(chosen, corners=_corners_by_slots(chosen, best))
-    return Found(best, chosen, walk.record(best))
+    return Found(best, chosen, walk.record(best), proposer.possible_screens(best.hypothesis))
 
 
 def _corners_by_slots(outline: Outline, best: Scored) -> FloatArray:

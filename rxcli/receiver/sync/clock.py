@@ -366,19 +366,23 @@ def sample_slots(
     return SlotSamples(light, valid, samples_per_slot)
 
 
-def possible_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> list[tuple[Clock, float]]:
-    """All assignments of the copies to bursts with their log-likelihood scores, likeliest first.
+def possible_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> list[tuple[Clock, float, float]]:
+    """All assignments of the copies to bursts, the most similar copies first.
 
     Args:
         clock: the clock.
         llr: (C, N) log-likelihood ratio of every slot being lit, 0 where it is not visible.
         repeats: how many copies a burst may have.
+
+    Returns:
+        Clocks, log-likelihood ratios of their copies against different ones, and prior probabilities.
     """
     scores = copy_similarity(llr, clock)
-    out: dict[bytes, tuple[Clock, float]] = {}
-    for _, burst in _assignments(clock.n_copies, repeats):
-        score = float(np.where(burst[1:] == burst[:-1], scores, -scores).sum()) / 2
-        out.setdefault(burst.tobytes(), (replace(clock, burst=burst), score))
+    out: dict[bytes, tuple[Clock, float, float]] = {}
+    for n, burst in _assignments(clock.n_copies, repeats):
+        score, before = float(scores[burst[1:] == burst[:-1]].sum()), out.get(burst.tobytes())
+        prior = 1 / (n * len(repeats)) + (before[2] if before else 0.0)
+        out[burst.tobytes()] = replace(clock, burst=burst), score, prior
     return sorted(out.values(), key=lambda assignment: -assignment[1])
 
 

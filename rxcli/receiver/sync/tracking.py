@@ -50,7 +50,12 @@ class LinkTime:
     @property
     def sure_slots(self) -> float:
         """Tolerance of the prediction, slots; wide at first, since time stamps may be rounded to milliseconds."""
-        return SETTINGS.max_jump_slots if self._period is not None else self.packet_slots / 4
+        return SETTINGS.max_jump_slots if self.is_measured else self.packet_slots / 4
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether the slots from frame to frame are known, so that a further clock agrees or contradicts."""
+        return self._period is not None
 
     def predict(self, frame: int, time_s: float) -> float | None:
         """Predict the slot of sensor row 0 in a frame from earlier clocks; None before the first."""
@@ -192,6 +197,13 @@ class BurstPhase:
     def repeats(self) -> int:
         """Likeliest number of copies of a burst."""
         return int(self._hypotheses[int(self._score.argmax()), 0])
+
+    def certainty(self, copies: IntArray) -> float:
+        """Probability that some copies, by their numbers in the clip, are one packet."""
+        repeats, phases = self._hypotheses.T
+        bursts = (copies[:, None] + phases) // repeats
+        weight = np.exp(self._score - self._score.max()) / repeats
+        return float(weight[(bursts == bursts[:1]).all(axis=0)].sum() / weight.sum())
 
     def update(self, first_copy: int, llr: FloatArray) -> None:
         """Compare the copies of a frame with each other and with earlier ones.

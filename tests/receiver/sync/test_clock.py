@@ -201,8 +201,9 @@ def test_bursts_in_every_way_likeliest_first() -> None:
     llr = np.concatenate([sent[0], sent[0], sent[1], sent[1], sent[1]], axis=1)
     possible = sync.possible_bursts(clock_, llr, (REPEATS,))
     assert possible[0][0].burst.tolist() == [0, 0, 1, 1, 1]
-    assert sorted(one.burst.tolist() for one, _ in possible) == [[0, 0, 0, 1, 1], [0, 0, 1, 1, 1], [0, 1, 1, 1, 2]]
-    scores = [score for _, score in possible]
+    assert sorted(one.burst.tolist() for one, _, _ in possible) == [[0, 0, 0, 1, 1], [0, 0, 1, 1, 1], [0, 1, 1, 1, 2]]
+    scores = [score for _, score, _ in possible]
+    assert sum(prior for *_, prior in possible) == pytest.approx(1)
     assert scores == sorted(scores, reverse=True)
     assert scores[0] - scores[1] > 100
     assert possible[0][0].burst.tolist() == [0, 0, 1, 1, 1]

@@ -1,0 +1,107 @@
+"""How sure the length of packets is, and which copies are one packet.
+
+The start of a long packet looks like the whole of a shorter one while the next header is not in view, and the copies of
+a burst look like those of two while they show different slots. Such framings of the same slots are rivals: each has the
+evidence of the same light, and a header that should show and does not counts against it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from rxcli.profiles import ScreenProfile
+from rxcli.protocol import PREAMBLE_SLOTS
+from rxcli.receiver import channel
+from rxcli.receiver.decode import detect
+from rxcli.receiver.decode.settings import SETTINGS as DECODE
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.passes import Reception
+from rxcli.receiver.frame.settings import SETTINGS as PASSES
+from rxcli.receiver.light import slot_llr
+from rxcli.receiver.search import evidence
+from rxcli.receiver.search.settings import SETTINGS
+from rxcli.receiver.still import detected
+from rxcli.receiver.sync import clock as sync
+from rxcli.types import Clock, FloatArray
+
+#: Limit of log-odds, so that no single picture settles a question for ever.
+_MAX_LOG_ODDS = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Framing:
+    """Probabilities of a reception's clock."""
+
+    #: That packets have its length: before the picture, and with it; and (B,) that moreover the copies of each burst
+    #: are one packet.
+    prior: float
+    length: float
+    bursts: FloatArray
+
+    @property
+    def gain(self) -> float:
+        """Log-odds of the length that the picture adds."""
+        return log_odds(self.length) - log_odds(self.prior)
+
+
+def log_odds(probability: float) -> float:
+    """Log-odds of a probability, within limits."""
+    least = 1 / (1 + np.exp(_MAX_LOG_ODDS))
+    bounded = float(np.clip(probability, least, 1 - least))
+    return float(np.log(bounded / (1 - bounded)))
+
+
+def framing_of(acquisition: Acquisition, reception: Reception, screens: Sequence[ScreenProfile]) -> Framing:
+    """How sure the length of packets and the copies of bursts are.
+
+    Args:
+        acquisition: the screen that was chosen.
+        reception: its reception.
+        screens: all screens that the camera may have seen.
+    """
+    own, llr = reception.clock, slot_llr(reception.metrics)
+    single = replace(own, burst=np.arange(own.n_copies))
+    by_copy = detect.header_llr(channel.by_burst(reception.metrics, single))
+    headers = np.clip(by_copy, -DECODE.max_llr, DECODE.max_llr).sum(axis=1)
+    header = int(headers.argmax()) * own.packet_slots - own.first_slot
+    lengths = {own.packet_slots: acquisition.repeats}
+    if np.count_nonzero(headers > DECODE.max_llr) < 2:
+        for screen in screens:
+            if screen.packet_slots != own.packet_slots:
+                lengths[screen.packet_slots] = (*lengths.get(screen.packet_slots, ()), screen.repeats)
+    framings = {
+        length: sync.possible_bursts(_framed(own, header, length), llr, repeats) for length, repeats in lengths.items()
+    }
+    likeliest, *rivals = framings[own.packet_slots]
+    # A packet starts anywhere in its length.
+    prior = 1 / sum(own.packet_slots / length for length in {own.packet_slots, *(s.packet_slots for s in screens)})
+    is_plain = all(likeliest[1] - rival[1] > PASSES.plain_bursts for rival in rivals)
+    if len(lengths) == 1 and is_plain and np.array_equal(likeliest[0].burst, own.burst):
+        return Framing(prior, 1.0, np.ones(int(own.burst.max()) + 1))
+    log_weight = np.array([_log_weight(reception, *framing) for each in framings.values() for framing in each])
+    weight = np.exp(log_weight - log_weight.max())
+    of_ways = weight[: 1 + len(rivals)] / weight.sum()
+    ways = np.array([clock.burst for clock, _, _ in (likeliest, *rivals)])
+    places = own.to_copies(np.ones(own.n_slots, bool))
+    counts, bursts = places[:, PREAMBLE_SLOTS:].any(axis=1), np.zeros(int(own.burst.max()) + 1)
+    for burst in range(bursts.size):
+        copies = ways[:, counts & (own.burst == burst)]
+        bursts[burst] = of_ways[(copies == copies[:, :1]).all(axis=1)].sum()
+    return Framing(prior, float(of_ways.sum()), bursts)
+
+
+def _framed(own: Clock, header: int, length: int) -> Clock:
+    """The clock with packets of another length, one of which starts at slot `header` of the grid."""
+    first_slot = -header % length
+    n_copies = -(-(first_slot + own.n_slots) // length)
+    return replace(own, packet_slots=length, first_slot=first_slot, burst=np.zeros(n_copies, np.int64))
+
+
+def _log_weight(reception: Reception, clock: Clock, similarity: float, prior: float) -> float:
+    """Log-likelihood of a framing and its prior."""
+    posteriors = detected(reception.metrics, clock)
+    framed = replace(reception, clock=clock, posteriors=posteriors, free_log_evidence=None)
+    return SETTINGS.temper * evidence.log_evidence(framed) + similarity + float(np.log(prior / clock.packet_slots))

@@ -1,0 +1,61 @@
+"""What a picture leaves open of the length of packets, and of which copies are one packet, lowers the confidence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from row_profiles import Shot, random_link, row_profiles, sigma_of
+
+from rxcli.profiles import ScreenProfile, shipped_profiles
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.search.framing import Framing, framing_of
+from rxcli.receiver.still import initial_pass
+from rxcli.receiver.sync import clock as sync
+
+SCREENS = tuple(screen for screen in shipped_profiles(ScreenProfile) if screen.columns == 20)
+ROWS_PER_SLOT = 4.0
+#: Share of packets of 70 slots that start at one place, beside those of 130 and 260 slots.
+PRIOR = 1 / (1 + 70 / 130 + 70 / 260)
+
+
+def framed(sent: str, taken_for: str, start_slot: float, n_slots: int, names: str = "") -> Framing:
+    """Receive a window of slots as of a screen; `names` begins the names of the screens that are possible."""
+    rng = np.random.default_rng(1)
+    screens = {screen.name: screen for screen in SCREENS}
+    own = screens[taken_for]
+    shot = Shot(ROWS_PER_SLOT, start_slot=start_slot, n_rows=round(n_slots * ROWS_PER_SLOT))
+    profiles = row_profiles(random_link(rng, [5] * 20, screens[sent].payload_symbols), shot, rng)
+    clock = sync.find_clock(profiles, ROWS_PER_SLOT, 1.0, own.packet_slots, sigma_of(profiles))
+    assert clock is not None
+    possible = tuple(screen for screen in SCREENS if screen.name.startswith(names))
+    variants = tuple(screen for screen in possible if screen.packet_slots == own.packet_slots)
+    acquisition = Acquisition(own, profiles, clock, variants)
+    return framing_of(acquisition, initial_pass(acquisition), possible)
+
+
+@pytest.mark.parametrize("sent", ["paper-8k65", "paper-17k3", "paper-34k6"])
+def test_one_header_in_view_leaves_the_length_open(sent: str) -> None:
+    """Whatever was sent: the slots of the window are those of either screen."""
+    framing = framed(sent, "paper-8k65", 520 - 30.0, 66)
+    assert framing.prior == pytest.approx(PRIOR)
+    assert framing.length == pytest.approx(PRIOR, abs=0.1)
+    assert framing.gain == pytest.approx(0.0, abs=0.5)
+
+
+@pytest.mark.parametrize("n_slots", [78, 84, 100])
+def test_a_header_that_should_show_and_does_not_excludes_the_length(n_slots: int) -> None:
+    assert framed("paper-17k3", "paper-8k65", 520 - 2.0, n_slots).length < 0.01
+
+
+def test_two_headers_in_view_settle_the_length() -> None:
+    framing = framed("paper-8k65", "paper-8k65", 210 - 5.0, 150)
+    assert framing.length == 1.0
+    assert framing.bursts == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("name", "certainty"), [("paper-8k65", 2 / 3), ("data-8k65", 1.0)])
+def test_copies_that_show_different_slots_may_be_two_packets(name: str, certainty: float) -> None:
+    """One boundary in three of a screen of three copies is that of two bursts; one of single copies knows no others."""
+    framing = framed("paper-8k65", name, 210 - 35.0, 66, name)
+    assert framing.length == pytest.approx(1.0)
+    assert framing.bursts == pytest.approx(certainty, abs=0.1)
