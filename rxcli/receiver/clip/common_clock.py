@@ -33,7 +33,7 @@ class Start:
     time: LinkTime
     #: How much likelier the headers' place is than the best elsewhere.
     lead: float
-    #: Log-likelihood of headers there, against none; and probability of this length among those that were compared.
+    #: Log-likelihood of headers there, against none; and probability of this length against the others compared.
     log_evidence: float
     certainty: float = 1.0
 

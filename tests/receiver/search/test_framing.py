@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from row_profiles import Shot, random_link, row_profiles, sigma_of
 
-from rxcli.profiles import ScreenProfile, shipped_profiles
+from rxcli.options import ReceiverOptions
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.search.framing import Framing, framing_of
 from rxcli.receiver.still import initial_pass
 from rxcli.receiver.sync import clock as sync
 
-SCREENS = tuple(screen for screen in shipped_profiles(ScreenProfile) if screen.columns == 20)
+SCREENS = tuple(screen for screen in ReceiverOptions().screens if screen.columns == 20)
 ROWS_PER_SLOT = 4.0
 #: Share of packets of 70 slots that start at one place, beside those of 130 and 260 slots.
 PRIOR = 1 / (1 + 70 / 130 + 70 / 260)
