@@ -94,7 +94,7 @@ def framing_of(acquisition: Acquisition, reception: Reception, screens: Sequence
 
 
 def _framed(own: Clock, header: int, length: int) -> Clock:
-    """The clock with packets of another length, one of which starts at slot `header` of the grid."""
+    """The clock with packets of another length; one starts at slot `header` of the grid."""
     first_slot = -header % length
     n_copies = -(-(first_slot + own.n_slots) // length)
     return replace(own, packet_slots=length, first_slot=first_slot, burst=np.zeros(n_copies, np.int64))
