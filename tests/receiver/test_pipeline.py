@@ -363,6 +363,7 @@ def test_a_screen_too_small_says_how_much_it_needs() -> None:
     quick = msgspec.structs.replace(camera, modes=(msgspec.structs.replace(mode, line_delay_s=line_delay / 4),))
     result = received(frame_of(taken, pixels), replace(options, cameras=(quick,)))
     assert result.message is not None
+    assert "a picture shows 19 % of a packet: send 6 more photos, or film" in result.message
     assert result.message.index("the screen may have no profile here") < result.message.index("a faster slot rate")
 
 

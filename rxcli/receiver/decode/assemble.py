@@ -235,9 +235,16 @@ def _incomplete_reason(n_observed: IntArray) -> str:
         return OUT_OF_VIEW
     missing = int((n_observed[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
     return (
-        f"no packet is in view as a whole: of {n_observed.shape[1]} slots {missing} are missing; move closer so that "
-        "the screen fills more of the height, or take another picture"
+        f"no packet is in view as a whole: of {n_observed.shape[1]} slots {missing} are missing; "
+        f"{further_pictures(float((n_observed > 0).mean(axis=1).max()))}, or move closer so that the screen fills more "
+        "of the height"
     )
+
+
+def further_pictures(share: float) -> str:
+    """What to do if a picture shows a share of a packet: further ones show the rest of a text."""
+    n = int(np.ceil(1 / max(share, 0.05)))
+    return f"a picture shows {100 * share:.0f} % of a packet: send {n} more photo{'s' if n > 1 else ''}, or film"
 
 
 def _light_reason(status: ColumnStatus, snr_db: float | None) -> str:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
+from rxcli.receiver.decode.assemble import further_pictures
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
@@ -221,7 +222,7 @@ def too_small(context: FrameContext, screen: ScreenProfile) -> str | None:
     needed = screen.packet_s / (camera.line_delay_s * frame.height)
     if fill >= needed:
         return None
-    advice = "move closer" if needed < 1 else _TOO_SLOW
+    advice = "move closer" if needed < 1 else f"{further_pictures(fill / needed)}; {_TOO_SLOW}"
     return (
         f"the screen fills {np.floor(100 * fill):.0f} % of the height: one packet at {screen.slot_rate_hz / 1e3:g} kHz "
         f"needs {np.ceil(100 * needed):.0f} % with this camera; {advice}"

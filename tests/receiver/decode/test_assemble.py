@@ -239,7 +239,7 @@ def test_nothing_decoded_says_why() -> None:
     short = clock_of(30, 0, [0])
     (few, _) = results_of(short, unsure, snr(30), samples_of(30), 0)
     assert few.message is not None
-    assert "of 50 slots 20 are missing" in few.message
+    assert "of 50 slots 20 are missing; a picture shows 60 % of a packet: send 2 more photos, or film" in few.message
     for column in (bright, dark, few):
         assert "\n" not in (column.message or "")
         assert "; " in (column.message or "")
