@@ -23,10 +23,10 @@ from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Points over which the mean of a sample or a strip is taken.
 _FINE = 32
-#: Slots of exposure that each further two slots of ISI memory cover.
+#: Longest exposure that a memory of one slot covers, slots; those at its ends are hardly exposed.
 _MEMORY_SLOTS = 1.3
-#: Longest ISI memory of the trellis; five slots cover an exposure of four.
-_MAX_MEMORY = 5
+#: Longest ISI memory of the trellis; seven slots cover an exposure of seven.
+_MAX_MEMORY = 7
 #: The dark slots in the middle of a header.
 _DARK_FROM = HEADER.index(0, HEADER.index(1))
 _DARK_TO = HEADER.index(1, _DARK_FROM)
@@ -137,7 +137,7 @@ class Exposure:
             samples_per_slot: samples per slot, Q.
         """
         # Odd, so that metrics lie between samples; the slots at both ends are hardly exposed.
-        isi_memory = int(np.clip(2 * np.ceil(exposure_slots / _MEMORY_SLOTS) - 1, 1, _MAX_MEMORY))
+        isi_memory = int(np.clip(2 * np.ceil((exposure_slots - _MEMORY_SLOTS) / 2) + 1, 1, _MAX_MEMORY))
         q = samples_per_slot
         # A sample is a mean over its own length.
         offsets = ((np.arange(_FINE) + 0.5) / _FINE - 0.5) / q

@@ -117,7 +117,7 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     single = replace(clock, burst=np.arange(clock.n_copies))
     alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
     lit = single.on_grid(alone.lit)
-    metrics = channel.metrics_of(_llr_of(lit), model.exposure.isi_memory)
+    metrics = channel.metrics_of(llr_of(lit), 1)
     clock = _in_bursts(acquisition, clock, metrics)
     bursts = of_bursts(clock, lit)
     posteriors = survivors.detect(bursts, QUICK_SURVIVORS)
@@ -146,7 +146,7 @@ def _joint_snr(
     return np.asarray(ratio[..., q // 2 :: q].sum(axis=1) * np.float32(survivor_settings.information))
 
 
-def _llr_of(lit: Float32Array) -> Float32Array:
+def llr_of(lit: Float32Array) -> Float32Array:
     """Log-likelihood ratios of slots from their probabilities."""
     bounded = np.clip(lit, _MIN_DOUBT, 1 - _MIN_DOUBT)
     return np.asarray(np.log(bounded) - np.log1p(-bounded), np.float32)

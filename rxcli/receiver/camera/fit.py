@@ -54,8 +54,11 @@ def settle(
     )
     start = np.concatenate([[clock.row0, clock.rows_per_slot], _turned(hypothesis.curvature, hypothesis)])
     least = hypothesis.stated_exposure_slots
-    exposure, exposure_sd = model.exposure(start, max(clock.exposure_slots, least))
-    exposure = max(exposure, least)
+    exposure, exposure_sd = max(clock.exposure_slots, least), 0.0
+    # A longer one is known better by the changes of the light.
+    if exposure <= SETTINGS.long_exposure_slots:
+        exposure, exposure_sd = model.exposure(start, exposure)
+        exposure = max(exposure, least)
     values, covariance, near = model.fit(start, exposure, start.size if may_bend else 2)
     if may_bend and _chi_square(values[2:], covariance[2:, 2:]) < SETTINGS.bent_chi_square:
         values, covariance, near = model.fit(values * (np.arange(values.size) < 2), exposure, 2)

@@ -8,14 +8,15 @@ similarity of neighbouring columns; `fit` estimates it from the decoded slots.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
 from rxcli.numerics import NORMAL_MEDIAN, TINY, folded, header_correlation, local_mean, peak_offset
 from rxcli.profiles import ScreenProfile
-from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.curvature import likeliest_bend, straightened
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import ColumnStrips, columns_of, joined, levelled
@@ -23,6 +24,8 @@ from rxcli.types import Float32Array, FloatArray
 
 #: Samples a slot at which headers are sought; bins of the spectrum to a line's width.
 _SAMPLES, _FINE = 4, 4
+#: Shape of a slot's difference from the next, _SAMPLES a slot.
+_TRIANGLE = np.convolve(np.full(_SAMPLES, 1 / _SAMPLES), np.full(_SAMPLES, 1 / _SAMPLES))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,22 +74,18 @@ def propose(
     level *= weight
     bends = [np.zeros(4)] + ([likeliest_bend(coarse, level)] if may_bend else [])
     found = [clock for bend in bends for clock in _clocks(coarse, level, bend, width, exposures)]
-    smeared: list[CameraHypothesis] = []
-    if max(exposures.values()) > SETTINGS.long_exposure_slots or not exposure_s:
-        stripes = _half_width(_autocorrelation(level.reshape(strips.n_columns, -1, level.shape[1]).mean(axis=1)))
-        smeared += _smeared_clocks(strips, exposures, stripes * coarse.pitch / strips.pitch, may_bend=may_bend)
-    if exposure_s:
-        return _distinct([], found + smeared)
-    # Where no exposure is stated, short ones come first.
-    return _distinct(_distinct([], found), smeared)
+    smeared = _distinct(_smeared_clocks(strips, exposures, may_bend=may_bend))
+    short = _distinct(clock for clock in found if not any(_is_same(clock, better) for better in smeared))
+    ranked = sorted(smeared + short, key=lambda clock: -clock.score)
+    return [replace(clock, number=number) for number, clock in enumerate(ranked)]
 
 
-def _distinct(first: list[CameraHypothesis], found: list[CameraHypothesis]) -> list[CameraHypothesis]:
-    """`first`, and the best few of the others that differ, numbered."""
-    out, most = list(first), len(first) + SETTINGS.n_proposed
-    for hypothesis in sorted(found, key=lambda clock: -clock.score):
-        if len(out) < most and not any(_is_same(hypothesis, better) for better in out):
-            out.append(replace(hypothesis, number=len(out)))
+def _distinct(found: Iterable[CameraHypothesis]) -> list[CameraHypothesis]:
+    """The best few that differ, the best first."""
+    out: list[CameraHypothesis] = []
+    for clock in sorted(found, key=lambda clock: -clock.score):
+        if len(out) < SETTINGS.n_proposed and not any(_is_same(clock, better) for better in out):
+            out.append(clock)
     return out
 
 
@@ -180,20 +179,16 @@ def _clocks(
 
 
 def _smeared_clocks(
-    strips: ColumnStrips, exposures: dict[int, float], half_width: float, *, may_bend: bool
+    strips: ColumnStrips, exposures: dict[int, float], *, may_bend: bool
 ) -> Iterator[CameraHypothesis]:
     """Clocks of light that is exposed for several slots: its changes over one slot are as sharp as a short exposure.
 
     Args:
         strips: of the picture.
         exposures: stated exposure in slots by packet length, 0 for none.
-        half_width: of the light's autocorrelation, rows; texture widens it, so that it limits the exposure.
         may_bend: whether the camera may have taken a distortion out.
     """
-    for rows, strength in slot_lines(strips):
-        longest = exposure_of(half_width / rows, rows * strips.pitch)
-        if longest < SETTINGS.long_exposure_slots and not any(exposures.values()):
-            continue
+    for rows, strength, exposure_slots in _long_exposures(strips, is_stated=any(exposures.values())):
         change = changes_over(strips, rows)
         bends = [np.zeros(4)] + ([likeliest_bend(strips, change)] if may_bend else [])
         for bend in bends:
@@ -211,8 +206,7 @@ def _smeared_clocks(
                         packet_slots=length,
                         reversed=bool(is_reversed),
                         curvature=bend,
-                        exposure_slots=exposure
-                        or min(longest, _exposure_by_echo(total, rows, length, is_reversed=bool(is_reversed))),
+                        exposure_slots=exposure or exposure_slots,
                         score=max(header, 0.0) ** 2 + common,
                         rows_per_slot_sd=rows * rows * strips.pitch / (4 * columns.shape[1]),
                         curvature_sd=np.abs(bend) / 4,
@@ -220,35 +214,53 @@ def _smeared_clocks(
                     )
 
 
-def _exposure_by_echo(total: FloatArray, rows_per_slot: float, packet_slots: int, *, is_reversed: bool) -> float:
-    """Exposure, slots: in changes of the light, each header shows again an exposure later, inverted.
+def _long_exposures(strips: ColumnStrips, *, is_stated: bool) -> Iterator[tuple[float, float, float]]:
+    """Rows a slot, strength of their line and exposure in slots; none where the strongest line is of a short exposure."""
+    lines = slot_lines(strips)
+    lines = [line for line in lines if line[1] >= SETTINGS.min_line_share * lines[0][1]]
+    # Of light that is exposed for half a slot more than whole ones the line is at twice the rate.
+    lines += [(2 * rows, strength) for rows, strength in lines if not _is_among(2 * rows, lines)]
+    for number, (rows, strength) in enumerate(lines):
+        exposure = exposure_by_changes(columns_of(changes_over(strips, rows), strips.n_columns), rows)
+        if exposure > SETTINGS.long_exposure_slots or is_stated:
+            yield rows, strength, exposure
+        elif number == 0:
+            return
 
-    Args:
-        total: (R + 1,) running sum of the columns' mean change.
-        rows_per_slot: rows a slot.
-        packet_slots: slots of a packet.
-        is_reversed: whether rows run against the readout.
+
+def _is_among(rows: float, lines: list[tuple[float, float]]) -> bool:
+    return any(abs(np.log(rows / other)) < SETTINGS.same_clock for other, _ in lines)
+
+
+def exposure_by_changes(columns: Float32Array, rows_per_slot: float) -> float:
+    """Exposure of random words, slots, by changes (C, R) of the light over a slot; 0 where too little is in view.
+
+    A slot that comes into an exposure leaves it an exposure later, so that changes are unlike those an exposure before.
     """
-    step = rows_per_slot / _SAMPLES
-    places = np.arange(int((total.size - 1) / step) + 1) * step
-    response = header_correlation(np.interp(places, np.arange(total.size), total), _SAMPLES) / step
-    period = packet_slots * _SAMPLES
-    if response.size < period:
-        return SETTINGS.usual_long_exposure_slots
-    score = folded(-response[::-1] if is_reversed else response, period)
-    lags = np.arange(-_SAMPLES, 2 * SLOTS_PER_SYMBOL * _SAMPLES)
-    around = score.take(int(score.argmax()) + lags, mode="wrap")
-    header = np.cumsum(np.repeat(2.0 * np.array(HEADER) - 1, _SAMPLES))
-    silence = 3 * SLOTS_PER_SYMBOL * _SAMPLES
-    shape = header_correlation(np.pad(np.pad(header, (1, 0)), (silence, silence), mode="edge"), _SAMPLES)
-    echoes = np.arange(*SETTINGS.echo_slots, 1 / _SAMPLES)
+    lags, exposures, shapes = _likeness_of_changes()
+    if columns.shape[1] < 2 * lags[-1] * rows_per_slot:
+        return 0.0
+    overlap = np.arange(columns.shape[1], 0, -1)
+    likeness = np.interp(lags * rows_per_slot, np.arange(overlap.size), _autocorrelation(columns) / overlap)
+    return float(exposures[int((shapes @ likeness).argmax())])
 
-    def likeness(echo_slots: float) -> float:
-        at = silence + lags
-        model = shape[at] - np.interp(at - echo_slots * _SAMPLES, np.arange(shape.size), shape)
-        return float(model @ around / np.linalg.norm(model))
 
-    return float(max(echoes.tolist(), key=likeness))
+@cache
+def _likeness_of_changes() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(K,) lags and (E,) exposures in slots; (E, K) autocorrelation of the light's changes over a slot, of norm 1."""
+    step, reach = 1 / _SAMPLES, 3 * SLOTS_PER_SYMBOL
+    every = np.arange(-reach, reach + step / 2, step)
+    # Slots of a word have a fixed sum.
+    apart = np.abs(np.arange(-reach, reach + 1))
+    alike = np.where(apart == 0, 1.0, -np.maximum(1 - apart / SLOTS_PER_SYMBOL, 0) / (SLOTS_PER_SYMBOL - 1))
+    slots = np.convolve(np.interp(every, np.arange(-reach, reach + 1), alike), _TRIANGLE, "same")
+    exposures = np.arange(SETTINGS.min_exposure_slots, SETTINGS.longest_exposure_slots, SETTINGS.exposure_step)
+    lags = np.arange(0, SETTINGS.longest_exposure_slots + 1.5, step)
+    shapes = [
+        2 * np.interp(lags, every, slots) - np.interp(lags - e, every, slots) - np.interp(lags + e, every, slots)
+        for e in exposures.tolist()
+    ]
+    return lags, exposures, np.stack([shape / np.linalg.norm(shape) for shape in shapes])
 
 
 def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:

@@ -44,11 +44,12 @@ class EstimateSettings:
     same_clock: float = 4e-3
     n_proposed: int = 5
 
-    #: Exposure from which changes of the light are looked at, and the default one, slots.
+    #: Exposure from which changes of the light are looked at, the longest one and the step between those compared, slots.
     long_exposure_slots: float = 2.3
-    usual_long_exposure_slots: float = 4.0
-    #: Exposures that the echo of headers is sought at, slots.
-    echo_slots: tuple[float, float] = (1.5, 9.5)
+    longest_exposure_slots: float = 9.5
+    exposure_step: float = 0.1
+    #: Least strength of a line that is looked at, as a share of the strongest.
+    min_line_share: float = 0.5
     #: Rows over which bends of the light are taken; limits of a bend, in medians, and of a change, in rms; slots of
     #: the local level.
     bend_lags: tuple[int, ...] = (1, 2, 4, 8)

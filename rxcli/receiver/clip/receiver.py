@@ -15,6 +15,7 @@ import numpy as np
 
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
+from rxcli.receiver import channel
 from rxcli.receiver.clip.acquiring import FirstFrames
 from rxcli.receiver.clip.camera import Acquired, ClipCamera, Located
 from rxcli.receiver.clip.common_clock import common_clock
@@ -28,7 +29,7 @@ from rxcli.receiver.frame.passes import Reception, shows_steady_light
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.refusal import STEADY_LIGHT
-from rxcli.receiver.still import apply_autoencoder, decode
+from rxcli.receiver.still import apply_autoencoder, decode, llr_of
 from rxcli.receiver.sync import tracking
 from rxcli.types import FloatArray, Frame, FrameResult, OnTaps
 
@@ -276,4 +277,8 @@ def _can_track(acquired: Acquired, options: ReceiverOptions) -> bool:
 def _bursts_of(frame: Frame, reception: Reception) -> tracking.FrameBursts:
     by_copy = replace(reception.clock, burst=np.arange(reception.clock.n_copies))
     shown = np.minimum(assemble.slots_observed(reception.samples, by_copy), 1)
-    return tracking.FrameBursts(frame.index, 0, reception.clock, reception.metrics, shown)
+    metrics = reception.metrics
+    if reception.free_log_evidence is not None:
+        lit = reception.clock.on_grid(reception.posteriors.lit)
+        metrics = channel.metrics_of(llr_of(lit), reception.model.exposure.isi_memory)
+    return tracking.FrameBursts(frame.index, 0, reception.clock, metrics, shown)

@@ -11,7 +11,7 @@ import numpy as np
 from rxcli.numerics import TINY
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import plane
-from rxcli.receiver.channel import SlotLikelihoods, known_picture
+from rxcli.receiver.channel import SlotLikelihoods, by_burst, known_picture
 from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import Pose, View
@@ -22,7 +22,9 @@ from rxcli.receiver.light import MIN_VARIANCE, Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
+from rxcli.receiver.decode import detect
 from rxcli.receiver.sync import tracking
+from rxcli.receiver.sync.settings import SETTINGS as SYNC
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray, Outlines
 
 
@@ -104,7 +106,7 @@ class TrackedScreen:
         if clock is None:
             return None
         with timer("detect"):
-            lit = known_picture.first_decision(columns, known_picture.row_positions(pose.rows, clock), clock)
+            lit = _first_decision(columns, pose.rows, clock, last.isi_memory)
             observed = _Observed(pose.rows, light, columns, last.isi_memory)
             measured = _measured(picture, observed, clock, lit, max_misfit)
             if measured is None:
@@ -283,6 +285,20 @@ class _Observed:
     columns: ColumnLight
     #: Number of earlier slots that influence the light of a slot.
     isi_memory: int
+
+
+def _first_decision(columns: ColumnLight, rows: FloatArray, clock: Clock, isi_memory: int) -> Float32Array:
+    """(C, N) probability that each slot is lit; each packet by itself where exposures show many slots at once."""
+    positions = known_picture.row_positions(rows, clock)
+    if clock.exposure_slots <= SYNC.long_exposure_slots:
+        return known_picture.first_decision(columns, positions, clock)
+    half = np.full((len(columns.value), clock.n_slots), 0.5, np.float32)
+    response = known_picture.Response()
+    expected = known_picture.expected_light(half, positions, clock.exposure_slots, isi_memory, response)
+    metrics = known_picture.slot_likelihoods(columns, expected, clock, isi_memory).metrics
+    bursts = by_burst(metrics, replace(clock, burst=np.arange(clock.n_copies)))
+    posteriors = detect.detect(bursts, detect.plausible_weights(bursts, 0.0))
+    return clock.on_grid(posteriors.lit)
 
 
 def _measured(

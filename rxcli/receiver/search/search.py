@@ -167,7 +167,10 @@ class _Walk:
             hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
             if hypothesis is None:
                 break
-            best = replace(self._measured(hypothesis, _acquired(hypothesis)), hypothesis=best.hypothesis)
+            fitted = replace(self._measured(hypothesis, _acquired(hypothesis)), hypothesis=best.hypothesis)
+            if fitted.evidence < best.evidence:
+                break
+            best = fitted
         return best
 
     def best_without_packets(self) -> Scored | None:

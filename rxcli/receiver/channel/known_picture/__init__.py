@@ -10,6 +10,7 @@ compression, `header` measures the contrast of headers, and `metrics` computes s
 """
 
 from rxcli.receiver.channel.known_picture.exposure import expected_light, row_positions
+from rxcli.receiver.channel.known_picture.exposure import Response
 from rxcli.receiver.channel.known_picture.header import first_decision, header_contrast
 from rxcli.receiver.channel.known_picture.metrics import slot_likelihoods
 from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Observation, PlacedPicture
@@ -20,6 +21,7 @@ __all__ = [
     "KnownPicture",
     "Observation",
     "PlacedPicture",
+    "Response",
     "expected_light",
     "first_decision",
     "fit_response",

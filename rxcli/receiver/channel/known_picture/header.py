@@ -41,12 +41,14 @@ def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) 
         positions: (C, R) or (1, R) exposure's centre of the rows, in slots.
         clock: the clock.
     """
-    place = (np.floor(positions).astype(np.int64) + clock.first_slot) % clock.packet_slots
-    rows = np.flatnonzero((place < SLOTS_PER_SYMBOL).any(axis=0))
-    place = place[:, rows]
-    sign = np.where(place < SLOTS_PER_SYMBOL, 2.0 * np.array(HEADER)[np.minimum(place, SLOTS_PER_SYMBOL - 1)] - 1, 0)
+    place = (positions + clock.first_slot + SLOTS_PER_SYMBOL) % clock.packet_slots - SLOTS_PER_SYMBOL
+    rows = np.flatnonzero((np.abs(place - SLOTS_PER_SYMBOL / 2) < (SLOTS_PER_SYMBOL + clock.exposure_slots) / 2).any(axis=0))
+    half, total = clock.exposure_slots / 2, np.concatenate([[0.0], np.cumsum(2.0 * np.array(HEADER) - 1)])
+    late, early = (np.interp(place[:, rows] + end, np.arange(total.size), total) for end in (half, -half))
+    shape = (late - early) / clock.exposure_slots
     value, precision = (values.take(rows, axis=1) for values in (observed.value, observed.precision))
-    weight = np.abs(sign) * np.minimum(precision, np.float32(SETTINGS.prior_precision))
+    weight = np.abs(shape) * np.minimum(precision, np.float32(SETTINGS.prior_precision))
     if weight.sum() < SETTINGS.prior_precision * SETTINGS.min_header_rows:
         return 1.0
-    return float((weight * sign * np.clip(2 * value - 1, -1.5, 1.5)).sum() / weight.sum())
+    weight = weight * np.sign(shape)
+    return float((weight * np.clip(2 * value - 1, -1.5, 1.5)).sum() / (weight * shape).sum())
