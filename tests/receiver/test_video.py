@@ -70,10 +70,17 @@ def simulate(
     frame_rate_hz: float = 60000 / 1001,
     screen: str = "paper-8k65",
     readout_s: float | None = None,
+    exposure_slots: float | None = None,
+    height_scale: float = 0.5,
 ) -> Clip:
     """Nearly the whole height is screen: a frame shows 1.5 packets, so that bursts fall into two or three frames."""
     scene = preset("video-1080p", screen)
-    scene = (scene if readout_s is None else scene.read_in(readout_s)).scaled(0.32, 0.5, keep_readout=True)
+    scene = (scene if readout_s is None else scene.read_in(readout_s)).scaled(0.32, height_scale, keep_readout=True)
+    if exposure_slots is not None:
+        longer = exposure_slots / (scene.exposure_s * scene.screen.slot_rate_hz)
+        scene = replace(
+            scene, exposure_s=longer * scene.exposure_s, light_e_per_s=scene.light_e_per_s / max(longer, 1.0)
+        )
     left, right, n_rows = 20.0, scene.sensor.width - 22.0, scene.sensor.height
     top, bottom = n_rows * (1 - height) / 2, n_rows * (1 + height) / 2
     corners = ((left, top), (right, top + 3), (right - 2, bottom), (left + 3, bottom - 2))

@@ -34,7 +34,10 @@ STEADY_LIGHT = (
 )
 _ONE_LAMP = f"all columns show the same light and no packets in it, as of a single lamp; {_NEXT}"
 _UNSURE = "no packet is sure; show a brighter picture or move closer"
-_SHORTER = "expose for 1/8000 s or less, with the electronic shutter, HDR and night mode off"
+_SHORTER = (
+    "drag the camera app's exposure down until the picture is nearly dark, or expose for 1/8000 s or less, with the "
+    "electronic shutter, HDR and night mode off"
+)
 _NO_HEADER = "a screen was found but no packet header; check that it sends, the shutter is electronic and HDR is off"
 
 
@@ -56,6 +59,7 @@ def likeliest_reason(frame: Frame, result: FrameResult, options: ReceiverOptions
     if slots > SETTINGS.max_named_slots:
         stated = f"{1e6 * exposure_s:.0f} us" if exposure_s < 1e-3 else f"{1e3 * exposure_s:.3g} ms"
         fades = f"the exposure of {stated} that the file states lasts {slots:.0f} slots or more, in which stripes fade"
+        fades += f" (a screen of at most {SETTINGS.max_named_slots / exposure_s:.0f} slots a second suits it)"
     reason, _, advice = message.partition("; ")
     if result.status == "no_screen":
         return f"{reason}, and {fades}; {advice}" if fades and reason.endswith(NO_COLUMNS) else message
