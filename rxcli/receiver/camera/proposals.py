@@ -75,6 +75,8 @@ def propose(
     bends = [np.zeros(4)] + ([likeliest_bend(coarse, level)] if may_bend else [])
     found = [clock for bend in bends for clock in _clocks(coarse, level, bend, width, exposures)]
     smeared = _distinct(_smeared_clocks(strips, exposures, may_bend=may_bend))
+    if smeared:  # The width of stripes says as much of the longest exposures as it can.
+        found = [clock for clock in found if clock.exposure_slots < SETTINGS.long_exposure_slots]
     short = _distinct(clock for clock in found if not any(_is_same(clock, better) for better in smeared))
     ranked = sorted(smeared + short, key=lambda clock: -clock.score)
     return [replace(clock, number=number) for number, clock in enumerate(ranked)]
@@ -240,8 +242,12 @@ def exposure_by_changes(columns: Float32Array, rows_per_slot: float) -> float:
     lags, exposures, shapes = _likeness_of_changes()
     if columns.shape[1] < 2 * lags[-1] * rows_per_slot:
         return 0.0
+    # Headers are the same in all columns, and no random words.
+    own = columns - columns.mean(axis=0)
+    if np.square(own).mean() < np.square(columns).mean() / 2:
+        own = columns  # All columns send the same.
     overlap = np.arange(columns.shape[1], 0, -1)
-    likeness = np.interp(lags * rows_per_slot, np.arange(overlap.size), _autocorrelation(columns) / overlap)
+    likeness = np.interp(lags * rows_per_slot, np.arange(overlap.size), _autocorrelation(own) / overlap)
     return float(exposures[int((shapes @ likeness).argmax())])
 
 
