@@ -180,9 +180,7 @@ def _clocks(
                 )
 
 
-def _smeared_clocks(
-    strips: ColumnStrips, exposures: dict[int, float], *, may_bend: bool
-) -> Iterator[CameraHypothesis]:
+def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_bend: bool) -> Iterator[CameraHypothesis]:
     """Clocks of light that is exposed for several slots: its changes over one slot are as sharp as a short exposure.
 
     Args:
@@ -217,7 +215,7 @@ def _smeared_clocks(
 
 
 def _long_exposures(strips: ColumnStrips, *, is_stated: bool) -> Iterator[tuple[float, float, float]]:
-    """Rows a slot, strength of their line and exposure in slots; none where the strongest line is of a short exposure."""
+    """Rows a slot, strength of their line, and exposure in slots; none if the strongest is of a short exposure."""
     lines = slot_lines(strips)
     lines = [line for line in lines if line[1] >= SETTINGS.min_line_share * lines[0][1]]
     # Of light that is exposed for half a slot more than whole ones the line is at twice the rate.
@@ -242,13 +240,13 @@ def exposure_by_changes(columns: Float32Array, rows_per_slot: float) -> float:
     lags, exposures, shapes = _likeness_of_changes()
     if columns.shape[1] < 2 * lags[-1] * rows_per_slot:
         return 0.0
-    # Headers are the same in all columns, and no random words.
-    own = columns - columns.mean(axis=0)
-    if np.square(own).mean() < np.square(columns).mean() / 2:
-        own = columns  # All columns send the same.
     overlap = np.arange(columns.shape[1], 0, -1)
-    likeness = np.interp(lags * rows_per_slot, np.arange(overlap.size), _autocorrelation(own) / overlap)
-    return float(exposures[int((shapes @ likeness).argmax())])
+    own = _autocorrelation(_own_light(columns)) / overlap
+    likeness = np.interp(lags * rows_per_slot, np.arange(overlap.size), own)
+    alike = shapes @ likeness
+    best = int(np.clip(alike.argmax(), 1, alike.size - 2))
+    offset = np.clip(peak_offset(*alike[best - 1 : best + 2]), -0.5, 0.5)
+    return float(exposures[best] + SETTINGS.exposure_step * offset)
 
 
 @cache
@@ -272,23 +270,31 @@ def _likeness_of_changes() -> tuple[FloatArray, FloatArray, FloatArray]:
 def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
     """Rows a slot and how far its line stands out, by the bends of the light, likeliest first.
 
-    Whatever the exposure, light bends between slots only.
+    Whatever the exposure, light bends between slots only: where a slot comes in, and the other way where it leaves. The
+    product of both has a line at the rate of the slots, even of exposures that are not whole slots.
     """
     black = SETTINGS.dark_share * float(np.percentile(strips.light, SETTINGS.dark_percent))
     light = np.log(np.maximum(strips.light - np.float32(black), np.float32(SETTINGS.min_light)))
     found: list[tuple[float, float]] = []
     for lag in SETTINGS.bend_lags:
-        if light.shape[1] < 8 * SLOTS_PER_SYMBOL * lag:
+        nearest, furthest = (int(slots * lag) for slots in SETTINGS.exposure_lags)
+        if light.shape[1] < 2 * furthest:
             continue
         smooth = _blurred(light, max(lag // 2, 1))
-        bend = np.abs(smooth[:, 2 * lag :] - 2 * smooth[:, lag:-lag] + smooth[:, : -2 * lag])
-        bend = np.minimum(bend / (np.median(bend, axis=1, keepdims=True) + np.float32(TINY)), SETTINGS.max_bend_ratio)
-        columns = bend.reshape(strips.n_columns, -1, bend.shape[1]).mean(axis=1)
-        columns -= _blurred(columns, 20 * SLOTS_PER_SYMBOL * lag // 2)
-        n = columns.shape[1]
-        power = np.square(np.abs(np.fft.rfft(columns * np.hanning(n), _FINE * n, axis=1)))
-        spectrum = (power / (power.mean(axis=1, keepdims=True) + TINY)).sum(axis=0)
-        spectrum /= _blurred(spectrum[None].astype(np.float32), SETTINGS.line_bins)[0] + np.float32(TINY)
+        bend = smooth[:, 2 * lag :] - 2 * smooth[:, lag:-lag] + smooth[:, : -2 * lag]
+        bend /= np.median(np.abs(bend), axis=1, keepdims=True) + np.float32(TINY)
+        most = np.float32(SETTINGS.max_bend_ratio)
+        bend = np.clip(bend, -most, most)
+        n = bend.shape[1]
+        columns, bends = (part.reshape(strips.n_columns, -1, n).mean(axis=1) for part in (bend, np.abs(bend)))
+        columns = _own_light(columns)
+        likeness = _autocorrelation(columns)[nearest:furthest] / np.arange(n, 0, -1)[nearest:furthest]
+        exposure = nearest + int(likeness.argmin())
+        product = np.zeros_like(columns)
+        product[:, exposure:] = -columns[:, :-exposure] * columns[:, exposure:]
+        # Together, and each column by itself, since the stripes of corrected pictures are bent.
+        parts = product.sum(axis=0, keepdims=True), product, bends
+        spectrum = np.asarray(sum(_line_spectrum(part, lag) for part in parts))
         frequency = np.arange(spectrum.size) / (_FINE * n)
         # The mosaic shows as periods of two and of four rows.
         mosaic = np.minimum(np.abs(frequency - 0.25), np.abs(frequency - 0.5)) < SETTINGS.mosaic_line
@@ -297,9 +303,24 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
         found += [(float(spectrum[round(peak)]), _FINE * n / peak) for peak in peaks.tolist() if peak > 0]
     distinct: list[tuple[float, float]] = []
     for strength, rows in sorted(found, reverse=True):
-        if len(distinct) < SETTINGS.n_peaks and all(abs(np.log(rows / r)) > SETTINGS.same_clock for r, _ in distinct):
+        if len(distinct) < SETTINGS.n_peaks and not _is_among(rows, distinct):
             distinct.append((rows, strength))
     return distinct
+
+
+def _line_spectrum(values: Float32Array, lag: int) -> FloatArray:
+    """Power of values (C, n) over what is usual at such frequencies; places are cycles times _FINE."""
+    values = values - _blurred(values, 20 * SLOTS_PER_SYMBOL * lag // 2)
+    n = values.shape[1]
+    power = np.square(np.abs(np.fft.rfft(values * np.hanning(n), _FINE * n, axis=1)))
+    spectrum = (power / (power.mean(axis=1, keepdims=True) + TINY)).sum(axis=0)
+    return np.asarray(spectrum / (_blurred(spectrum[None].astype(np.float32), SETTINGS.line_bins)[0] + TINY))
+
+
+def _own_light(columns: Float32Array) -> Float32Array:
+    """What columns (C, R) do not have in common, as headers, unless all of them send the same."""
+    own = columns - columns.mean(axis=0)
+    return own if np.square(own).mean() > np.square(columns).mean() / 2 else columns
 
 
 def changes_over(strips: ColumnStrips, rows: float) -> Float32Array:

@@ -44,12 +44,15 @@ class EstimateSettings:
     same_clock: float = 4e-3
     n_proposed: int = 5
 
-    #: Exposure from which changes of the light are looked at, the longest one and the step between those compared, slots.
+    #: Exposure from which changes of the light are looked at; the longest one, and the step between those compared,
+    #: slots.
     long_exposure_slots: float = 2.3
     longest_exposure_slots: float = 9.5
     exposure_step: float = 0.1
     #: Least strength of a line that is looked at, as a share of the strongest.
     min_line_share: float = 0.5
+    #: Exposures that are looked for, in the lags of bends.
+    exposure_lags: tuple[float, float] = (3.7, 66.0)
     #: Rows over which bends of the light are taken; limits of a bend, in medians, and of a change, in rms; slots of
     #: the local level.
     bend_lags: tuple[int, ...] = (1, 2, 4, 8)

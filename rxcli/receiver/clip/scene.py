@@ -15,6 +15,7 @@ from rxcli.receiver.channel import SlotLikelihoods, by_burst, known_picture
 from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import Pose, View
+from rxcli.receiver.decode import detect
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
@@ -22,7 +23,6 @@ from rxcli.receiver.light import MIN_VARIANCE, Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
-from rxcli.receiver.decode import detect
 from rxcli.receiver.sync import tracking
 from rxcli.receiver.sync.settings import SETTINGS as SYNC
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray, Outlines

@@ -37,7 +37,7 @@ class StillSettings:
     dark_shares: tuple[float, ...] = (0.0, 0.4, 0.7, 0.85, 1.0, 1.1)
     n_judged_columns: int = 5
     #: Exposures that are compared likewise, as factors.
-    exposure_factors: tuple[float, ...] = (0.87, 1.0, 1.15)
+    exposure_factors: tuple[float, ...] = (0.87, 0.96, 1.0, 1.04, 1.15)
     #: Limit of the log evidence of a column for an assignment of copies to bursts.
     max_column_gain: float = 40.0
     #: Least log probability of a weight by the initial pass that the joint detection starts from.

@@ -9,8 +9,7 @@ weights strips by their information, and gives each column as a single series wi
 compression, `header` measures the contrast of headers, and `metrics` computes slot log-likelihoods.
 """
 
-from rxcli.receiver.channel.known_picture.exposure import expected_light, row_positions
-from rxcli.receiver.channel.known_picture.exposure import Response
+from rxcli.receiver.channel.known_picture.exposure import Response, expected_light, row_positions
 from rxcli.receiver.channel.known_picture.header import first_decision, header_contrast
 from rxcli.receiver.channel.known_picture.metrics import slot_likelihoods
 from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Observation, PlacedPicture

@@ -42,7 +42,9 @@ def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) 
         clock: the clock.
     """
     place = (positions + clock.first_slot + SLOTS_PER_SYMBOL) % clock.packet_slots - SLOTS_PER_SYMBOL
-    rows = np.flatnonzero((np.abs(place - SLOTS_PER_SYMBOL / 2) < (SLOTS_PER_SYMBOL + clock.exposure_slots) / 2).any(axis=0))
+    rows = np.flatnonzero(
+        (np.abs(place - SLOTS_PER_SYMBOL / 2) < (SLOTS_PER_SYMBOL + clock.exposure_slots) / 2).any(axis=0)
+    )
     half, total = clock.exposure_slots / 2, np.concatenate([[0.0], np.cumsum(2.0 * np.array(HEADER) - 1)])
     late, early = (np.interp(place[:, rows] + end, np.arange(total.size), total) for end in (half, -half))
     shape = (late - early) / clock.exposure_slots
