@@ -36,6 +36,7 @@ class _Photographs(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class _Clips(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: tuple[float, ...]
+    long_weights: tuple[float, ...]
     max_log_odds: float
 
 
@@ -77,6 +78,8 @@ class BurstInClip:
     #: (C,) largest log-likelihood of any payload slot against its decision; None where the frames were received like
     #: photographs.
     against: Float32Array | None
+    #: Whether exposures last several slots.
+    is_long: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +140,8 @@ def clip_log_odds(burst: BurstInClip) -> FloatArray:
     """(1, C) calibrated log-odds of the packets of a burst of a clip being error-free."""
     if burst.confidence_features is not None:
         return confidence_log_odds(burst.confidence_features[None])
-    return np.asarray(clip_features(burst)[None] @ np.array(confidence_model().clips.weights))
+    model = confidence_model().clips
+    return np.asarray(clip_features(burst)[None] @ np.array(model.long_weights if burst.is_long else model.weights))
 
 
 def clip_features(burst: BurstInClip) -> FloatArray:
