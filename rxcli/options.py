@@ -166,7 +166,7 @@ def _profiles(named: tuple[Any, ...], kind: type[_Profile]) -> tuple[_Profile, .
         elif name != AUTO:
             found.append(load_profile(name, kind))
     known: list[_Profile] = [profile for profile, _, _ in known_profiles(kind)] if AUTO in named else []
-    return (*found, *(profile for profile in known if not getattr(profile, "only_named", False)))
+    return tuple(found + [profile for profile in known if not getattr(profile, "only_named", False)])
 
 
 def _checked_corners(corners: Any) -> FloatArray:

@@ -271,7 +271,9 @@ def _trellis(
 
     def forward(number: int, state: FloatArray) -> FloatArray:
         leads = np.matmul(state[..., None, :], transitions[number])[..., 0, :]
-        return leads if is_small else (leads.take(branches.prefix, axis=-1) * remainder[number]) @ branches.ends
+        if is_small:
+            return np.asarray(leads)
+        return np.asarray((leads.take(branches.prefix, axis=-1) * remainder[number]) @ branches.ends)
 
     def backward(number: int, state: FloatArray) -> FloatArray:
         if not is_small:
