@@ -277,6 +277,14 @@ def test_another_scene_while_frames_are_held_back(clip: Clip, monkeypatch: pytes
     assert score.error_free >= 0.9 * score.expected
 
 
+def test_wrong_times_do_not_make_the_only_possible_screen_unsure(clip: Clip) -> None:
+    """A clock that contradicts the link's time is no sign of another length of packets where none is possible."""
+    times_s = np.random.default_rng(2).uniform(0, 0.02, 8).cumsum()
+    frames = [replace(frame, time_s=float(at)) for frame, at in zip(clip.frames, times_s, strict=False)]
+    packets = [packet for result in receive(frames, clip.options) for packet in result.packets]
+    assert sum(packet.confidence > 0.9 for packet in packets) > 20
+
+
 def test_frames_before_and_after_an_occlusion_are_looked_at_again(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
     measured: list[list[int]] = []
 

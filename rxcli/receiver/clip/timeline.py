@@ -46,7 +46,13 @@ class Timeline:
         time = start.time if start else tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
         phase = tracking.BurstPhase(view.acquisition.repeats)
         prior = start.certainty if start else view.framing.prior if view.framing else 1.0
-        return cls(time, phase, _shape(view), length_log_odds=log_odds(prior), stamps_judged=stretch != 1)
+        return cls(
+            time,
+            phase,
+            _shape(view),
+            length_log_odds=log_odds(prior) if prior < 1 else np.inf,
+            stamps_judged=stretch != 1,
+        )
 
     def after(self, before: Timeline, view: View) -> Timeline:
         """Count on from an earlier time, with the bursts that passed until a frame."""
