@@ -22,7 +22,7 @@ from rxcli.receiver.screen import geometry
 from rxcli.types import Float32Array, FloatArray, Frame, Lens, LightPlane, Metadata, Outlines, RowProfiles
 
 #: Cached row profiles: of layouts with few and with many columns, and of uncertain outlines; and cached outlines.
-_MAX_SAMPLED, _MAX_OUTLINES = 4, 8
+_MAX_SAMPLED, _MAX_OUTLINES = 6, 12
 
 
 class FrameCache:
@@ -60,19 +60,21 @@ class FrameCache:
         """Outlines of the strips of a screen's columns; as many strips as its pixels allow."""
         bent = lens and (lens.camera_matrix.tobytes(), lens.dist_coeffs.tobytes(), lens.corrected)
         key = (corners.tobytes(), n_columns, bent)
-        if key not in self._outlines:
-            if len(self._outlines) >= _MAX_OUTLINES:
-                self._outlines.clear()
+        found = self._outlines.pop(key, None)  # and entered again, as the last one used
+        if found is None:
             n_strips = strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)
-            size = self.frame.width, self.frame.height
-            self._outlines[key] = geometry.column_outlines(corners, n_columns, n_strips, *size, lens)
-        return self._outlines[key]
+            found = geometry.column_outlines(corners, n_columns, n_strips, self.frame.width, self.frame.height, lens)
+            if len(self._outlines) >= _MAX_OUTLINES:
+                del self._outlines[next(iter(self._outlines))]
+        self._outlines[key] = found
+        return found
 
     def sample(self, outlines: Outlines, tone: str) -> RowProfiles:
         """Cached `sample_rows`; sensor rows are those of `outlines`, as a lens model may change them alone."""
-        for known_tone, edges, profiles in self._sampled:
+        for place, (known_tone, edges, profiles) in enumerate(self._sampled):
             same = known_tone == tone and profiles.light.shape == outlines.inside.shape
             if same and np.array_equal(edges, outlines.edges_x) and np.array_equal(profiles.rows, outlines.rows):
+                self._sampled.append(self._sampled.pop(place))  # as the last one used
                 return replace(profiles, sensor_row=outlines.sensor_row)
         profiles = sample_rows(self.plane, outlines, tone)
         self._sampled = [*self._sampled[-_MAX_SAMPLED + 1 :], (tone, outlines.edges_x, profiles)]
