@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,8 +22,14 @@ from rxcli.receiver.plane import (
 from rxcli.receiver.screen import geometry
 from rxcli.types import Float32Array, FloatArray, Frame, Lens, LightPlane, Metadata, Outlines, RowProfiles
 
+_Found = TypeVar("_Found")
 #: Cached row profiles: of layouts with few and with many columns, and of uncertain outlines; and cached outlines.
 _MAX_SAMPLED, _MAX_OUTLINES = 6, 12
+
+
+def key_of(lens: Lens | None) -> Hashable:
+    """A key that is equal for lenses with the same distortion."""
+    return lens and (lens.camera_matrix.tobytes(), lens.dist_coeffs.tobytes(), lens.corrected)
 
 
 class FrameCache:
@@ -37,6 +44,7 @@ class FrameCache:
         self.frame, self.timer = frame, timer or Timer()
         self._sampled: list[tuple[str, Float32Array, RowProfiles]] = []
         self._outlines: dict[tuple[Any, ...], Outlines] = {}
+        self._found: dict[Hashable, Any] = {}
 
     def in_blinking_colours(self) -> FrameCache:
         """The same picture, in green and blue alone if its red lags behind the slots."""
@@ -51,6 +59,13 @@ class FrameCache:
         changed.frame = replace(self.frame, metadata=metadata)
         return changed
 
+    def once(self, key: Hashable, find: Callable[[], _Found]) -> _Found:
+        """What `find` finds on the plane, which no metadata change; it is called once for a key."""
+        if key not in self._found:
+            self._found[key] = find()
+        found: _Found = self._found[key]
+        return found
+
     @cached_property
     def plane(self) -> LightPlane:
         """The plane of the frame."""
@@ -58,8 +73,7 @@ class FrameCache:
 
     def outlines(self, corners: FloatArray, n_columns: int, lens: Lens | None) -> Outlines:
         """Outlines of the strips of a screen's columns; as many strips as its pixels allow."""
-        bent = lens and (lens.camera_matrix.tobytes(), lens.dist_coeffs.tobytes(), lens.corrected)
-        key = (corners.tobytes(), n_columns, bent)
+        key = (corners.tobytes(), n_columns, key_of(lens))
         found = self._outlines.pop(key, None)  # and entered again, as the last one used
         if found is None:
             n_strips = strips_per_column(float(np.linalg.norm(corners[1] - corners[0])) / n_columns)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.decode.assemble import further_pictures
-from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.cache import FrameCache, key_of
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.plane import turned
@@ -65,7 +65,7 @@ def without_borders(cache: FrameCache) -> list[Outline]:
     if not may_fill(frame):
         return []
     with cache.timer("geometry"):
-        bright, striped = bright_quadrilateral(cache.plane), striped_box(cache.plane)
+        bright, striped = _bright(cache), cache.once("striped", lambda: striped_box(cache.plane))
     if striped is None:
         return []
     own = Outline(
@@ -73,6 +73,11 @@ def without_borders(cache: FrameCache) -> list[Outline]:
     )
     outlines = [own] if bright is None else [replace(own, corners=bright, log_odds=0.0, family=-1), own]
     return [_viewed(outline, frame) for outline in outlines]
+
+
+def _bright(cache: FrameCache) -> FloatArray | None:
+    """Corners of the bright part of a picture."""
+    return cache.once("bright", lambda: bright_quadrilateral(cache.plane))
 
 
 def _viewed(outline: Outline, frame: Frame) -> Outline:
@@ -83,7 +88,7 @@ def _viewed(outline: Outline, frame: Frame) -> Outline:
 def no_screen(cache: FrameCache, options: ReceiverOptions) -> Failure:
     """Failure of a picture without a screen."""
     reason = ON_ITS_SIDE if lean_on_its_side(cache, options) else reason_for_none(cache.frame)
-    if bright_quadrilateral(cache.plane) is not None:
+    if _bright(cache) is not None:
         reason += "; if the bright part is the screen, it is lit without slots"
     return Failure("no_screen", f"no screen found: {reason}")
 
@@ -99,9 +104,11 @@ def _given(corners: FloatArray, cache: FrameCache, options: ReceiverOptions) -> 
 def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[Outline]]:
     """Outlines that the finder proposes of every screen."""
     layouts, frame = layouts_of(options), cache.frame
+    lens = known_lens(frame, options)
     with cache.timer("geometry"):
-        bright = bright_quadrilateral(cache.plane)
-        screens = find.find_screens(cache.plane, layouts, known_lens(frame, options), bright)
+        bright = _bright(cache)
+        key = ("screens", *layouts, key_of(lens))
+        screens = cache.once(key, lambda: find.find_screens(cache.plane, layouts, lens, bright))
     wide = [layout.n_columns for layout in layouts if not layout.is_narrow]
 
     def viewed(outline: Outline) -> Outline:
@@ -180,11 +187,16 @@ def lean_on_its_side(cache: FrameCache, options: ReceiverOptions) -> float:
     Negative: the picture was turned after it was taken; positive: it was taken in portrait. Of a clip only the first
     frame is examined.
     """
+    layouts = [layout for layout in layouts_of(options) if not layout.is_narrow]
+    return cache.once(("lean", *layouts), lambda: _lean(cache, layouts))
+
+
+def _lean(cache: FrameCache, layouts: list[find.ColumnLayout]) -> float:
     frame = cache.frame
     if frame.index or not may_fill(frame) or frame.mosaic is not None:
         return 0.0
     plane = turned(cache.plane)
-    screens = find.find_screens(plane, [layout for layout in layouts_of(options) if not layout.is_narrow])
+    screens = find.find_screens(plane, layouts)
     corners = next((screen[0].corners for screen in screens if screen[0].stands_out), None)
     if corners is None:
         return 0.0
