@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import TINY
 from rxcli.types import Float32Array, FloatArray, LightPlane
 
 #: Pixels across the reduced picture, and the width of dark parts inside the screen that are filled, in such pixels.
@@ -18,6 +19,8 @@ _MIN_PICTURE, _MIN_FILL = 0.08, 0.93
 _STRAIGHT, _MAX_TURN = 1.5, 0.25
 #: Distance from the picture's edge, in such pixels, within which a side may be the picture's; maximum number of those.
 _AT_EDGE, _MAX_HIDDEN = 2.0, 1
+#: The clearest grey level.
+_WHITE = 255
 #: Of stripes: rows of the mean that they are taken against, bands of rows and cells side by side in which they are
 #: compared, minimum correlation there, and minimum amplitude, of 255 as the clearest.
 _STRIPE_ROWS, _BANDS, _NEAR, _MIN_LIKENESS, _STRIPED = 129, 25, 5, 0.5, 80
@@ -73,9 +76,9 @@ def _hull(cells: Float32Array, pixels: int, threshold: int = 0) -> tuple[NDArray
     import cv2
 
     small = cv2.resize(cells, (max(cells.shape[1] // pixels, 1), len(cells)), interpolation=cv2.INTER_AREA).T
-    small = np.clip(small * np.float32(255 / max(float(np.percentile(small, 99)), 1e-6)), 0, 255).astype(np.uint8)
+    small = np.clip(small * np.float32(_WHITE / max(float(np.percentile(small, 99)), TINY)), 0, _WHITE).astype(np.uint8)
     method = cv2.THRESH_BINARY if threshold else cv2.THRESH_OTSU
-    _, bright = cv2.threshold(small, threshold, 255, method)
+    _, bright = cv2.threshold(small, threshold, _WHITE, method)
     padded = cv2.copyMakeBorder(bright, _FILLED, _FILLED, _FILLED, _FILLED, cv2.BORDER_CONSTANT, value=0)
     padded = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((_FILLED, _FILLED), np.uint8))
     contours, _ = cv2.findContours(padded, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

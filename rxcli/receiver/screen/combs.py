@@ -53,10 +53,10 @@ class Comb:
         return abs(self.pitch - comb.pitch) < _SAME_PITCH and shape * self.pitch < _SAME_SHAPE
 
 
-@lru_cache(maxsize=64)
+@lru_cache
 def likeness(sigma: float, distance: float) -> float:
     """Mean over the phase of the correlation of two positions `distance` columns apart."""
-    middle, centres = np.arange(64) / 64, np.arange(-6, 8) + 0.5
+    middle, centres = np.linspace(0, 1, 64, endpoint=False), np.arange(-6, 8) + 0.5
     left, right = (np.exp(-((middle[:, None] + s * distance / 2 - centres) ** 2) / (2 * sigma**2)) for s in (-1, 1))
     cosine = (left * right).sum(-1) / np.sqrt((left**2).sum(-1) * (right**2).sum(-1))
     return float(cosine.mean())

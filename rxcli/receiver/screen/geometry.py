@@ -41,7 +41,7 @@ def viewer_order(corners: FloatArray, orientation: int) -> FloatArray:
         corners: (4, 2) pixels.
         orientation: EXIF orientation 1..8; for 5..8 the readout runs across the columns and 1..4 is taken.
     """
-    return corners[list(_VIEWER_CORNERS.get(orientation, (0, 1, 2, 3)))]
+    return corners[list(_VIEWER_CORNERS.get(orientation, _VIEWER_CORNERS[1]))]
 
 
 def lens_for(model: LensModel, width: int, height: int) -> Lens:
@@ -72,9 +72,7 @@ def distort(points: FloatArray, lens: Lens | None) -> FloatArray:
     """
     if lens is None:
         return points
-    k = np.zeros(8)
-    k[: min(lens.dist_coeffs.size, 8)] = lens.dist_coeffs[:8]
-    k1, k2, p1, p2, k3, k4, k5, k6 = k
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*lens.dist_coeffs, *np.zeros(8))[:8]
     (fx, _, cx), (_, fy, cy), _ = lens.camera_matrix
     x, y = (points[..., 0] - cx) / fx, (points[..., 1] - cy) / fy
     r2 = x * x + y * y

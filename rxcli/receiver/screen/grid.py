@@ -48,7 +48,7 @@ class Grid:
         """Lens with the estimated radial coefficient, or None if the lens is known."""
         if self.lens is not None:
             return None
-        radial = self.coefficients[5]
+        radial = self.coefficients[-1]
         matrix = np.array([[self.width, 0, (self.width - 1) / 2], [0, self.width, (self.height - 1) / 2], [0, 0, 1.0]])
         # `distort` goes the other way: the inverse series.
         return Lens(matrix, np.array([-radial, 3 * radial**2, 0.0, 0.0, 0.0]), corrected=False)
@@ -59,13 +59,13 @@ class Grid:
 
     def flat(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Offsets of (..., 2) pixels from the picture's middle in picture widths, with lens distortion removed."""
-        return straightened(self.coefficients[5], *flat_places(points, self.width, self.height, self.lens))
+        return straightened(self.coefficients[-1], *flat_places(points, self.width, self.height, self.lens))
 
     def pixels_of(self, flat: FloatArray) -> FloatArray:
         """(n, 2) pixels of (n, 2) offsets, the inverse of `flat`."""
         distorted = flat
         for _ in range(_INVERSE_STEPS):
-            distorted = flat / (1 + self.coefficients[5] * (distorted**2).sum(axis=-1, keepdims=True))
+            distorted = flat / (1 + self.coefficients[-1] * (distorted**2).sum(axis=-1, keepdims=True))
         pixels = distorted * self.width + np.array([(self.width - 1) / 2, (self.height - 1) / 2])
         return geometry.distort(pixels, geometry.bending(self.lens))
 

@@ -95,7 +95,6 @@ class ScreenTexture:
         #: Value and weight of the known texture, and the same on coarse and on fine cells; None if to be recomputed.
         self._mean: Float32Array = np.zeros((*SETTINGS.cells, 2), np.float32)
         self._known: tuple[_Known, _Known] | None = None
-        self._read_last: tuple[Frame, _Texture] | None = None
         self.learn(frame, Registration(corners, 0.0, 1.0))
 
     def find(self, frame: Frame) -> Registration:
@@ -122,15 +121,13 @@ class ScreenTexture:
         np.minimum(total, np.float32(SETTINGS.max_weight), out=before)
 
     def _texture_of(self, frame: Frame) -> _Texture:
-        """The texture of a frame around the last place of the screen and in its middle; that of one frame is cached."""
-        if self._read_last is None or self._read_last[0] is not frame:
-            corners = geometry.distort(self._flat, self._lens)
-            reach = SETTINGS.reach * _size(corners)
-            size = np.array([frame.width, frame.height])
-            start = (corners.min(axis=0) - reach).clip(0, size // 4).astype(int)
-            end = (corners.max(axis=0) + reach).clip(size - size // 4, size).astype(int)
-            self._read_last = frame, _texture_of(frame, start, end, *self._cell)
-        return self._read_last[1]
+        """The texture of a frame around the last place of the screen and in its middle."""
+        corners = geometry.distort(self._flat, self._lens)
+        reach = SETTINGS.reach * _size(corners)
+        size = np.array([frame.width, frame.height])
+        start = (corners.min(axis=0) - reach).clip(0, size // 4).astype(int)
+        end = (corners.max(axis=0) + reach).clip(size - size // 4, size).astype(int)
+        return _texture_of(frame, start, end, *self._cell)
 
     def _fit(self, texture: _Texture, known: _Known, flat: FloatArray) -> tuple[FloatArray, float, float]:
         """Corners (4, 2) on the undistorted picture, their standard deviation, and the textures' correlation.
@@ -142,7 +139,7 @@ class ScreenTexture:
         """
         prior = _prior_of_one() / _size(flat) ** 2
         # From the corners' motion along u and v to pixels, with the screen approximated by a parallelogram.
-        side_u, side_v = flat[1] - flat[0] + flat[2] - flat[3], flat[3] - flat[0] + flat[2] - flat[1]
+        side_u, side_v = flat[1] - flat[0] + flat[2] - flat[-1], flat[-1] - flat[0] + flat[2] - flat[1]
         by_pixels = np.linalg.inv(np.stack([side_u, side_v], axis=1) / 2).astype(np.float32)
         slopes = np.einsum("acvu,ab->cbvu", known.slopes, by_pixels).reshape(len(prior), -1)
         for _ in range(SETTINGS.max_steps):

@@ -132,7 +132,7 @@ def _light_along(strips: PictureStrips, light: Float32Array, axis: ScreenAxis) -
     u, x, y = (values[:, :whole].reshape(n_blocks, -1, n).mean(axis=2) for values in (u, strips.x, strips.y))
     inside = (u > 0) & (u < axis.n_columns)
     # A strip's rows of one window lie evenly along the screen.
-    radial = axis.grid.coefficients[5]
+    radial = axis.grid.coefficients[-1]
     ends = [axis.along(*straightened(radial, x[inside], y[inside] + side * strips.half_height)) for side in (-1, 1)]
     v = ends[0][:, None] + (ends[1] - ends[0])[:, None] * (np.arange(n_rows) + 0.5) / n_rows
     extent = 1 + 2 * _BEYOND

@@ -1,4 +1,4 @@
-"""Settings of the finder, each with its unit and the reason for it."""
+"""Settings of the registration of clips, each with its unit and the reason for it."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class ScreenSettings:
-    """Numbers of policy of the finder and of the registration of clips' frames."""
+    """Numbers of policy of the registration of a clip's frames by the texture of the screen.
 
-    # Texture of the screen in a clip; a screen's size is its width, or the width that its height implies.
+    A screen's size is its width, or the width that its height implies.
+    """
+
     #: Cells down and across the screen whose texture is known; cells of a coarse cell down and across, and smoothing of
     #: the coarse texture in such cells; minimum number of rows read in a cell.
     cells: tuple[int, int] = (108, 360)
