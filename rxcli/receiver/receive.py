@@ -146,11 +146,12 @@ def _receive_screen(
     )
     if camera.reversed:
         columns = tuple(assemble.in_stored_rows(column, frame.height) for column in columns)
+    tails = {"spread_tails": reception.model.tails} if reception.model.tails[0] else {}
     result = replace(
         nothing,
         status=assemble.frame_status(columns),
         **outline.result_fields,
-        **context.result_fields,
+        **{**context.result_fields, "estimated": {**context.result_fields["estimated"], **tails}},
         search=tuple(tried.step for tried in found.tried),
         screen_profile=acquisition.variant(sync.likely_repeats(reception.clock, acquisition.repeats)).name,
         columns=columns,

@@ -25,7 +25,15 @@ from rxcli.receiver.frame.settings import SETTINGS, STILL
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma, slot_llr
 from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.sync.settings import SETTINGS as SYNC
-from rxcli.types import BurstPosteriors, BurstSamples, Clock, Denoiser, Float32Array, FloatArray, SlotSamples
+from rxcli.types import (
+    BurstPosteriors,
+    BurstSamples,
+    Clock,
+    Denoiser,
+    Float32Array,
+    FloatArray,
+    SlotSamples,
+)
 
 #: Least distance of a slot's probability from 0 and 1.
 _MIN_DOUBT = 1e-4
@@ -60,7 +68,8 @@ def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception, *
         initial: the initial pass.
         adds_up: whether the metrics are to be added to those of other frames.
     """
-    reception, n_columns = initial, len(initial.snr)
+    reception = initial = _with_tails(acquisition, initial)
+    n_columns = len(initial.snr)
     candidates = doubtful_columns(initial) if "certain_columns" in skip else np.arange(n_columns)
     lit = candidates[~dark_columns(initial.snr)[candidates]] if "dark_columns" in skip else candidates
     skipped = {"certain_columns": n_columns - candidates.size, "dark_columns": candidates.size - lit.size}
@@ -73,6 +82,20 @@ def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception, *
     elif lit.size:
         reception = follow_picture(acquisition, reception, lit)
     return replace(reception, skipped={name: count for name, count in skipped.items() if count})
+
+
+def _with_tails(acquisition: Acquisition, initial: Reception) -> Reception:
+    """The initial pass with crosstalk as decided slots show it, where that is wider than in the screen's profile."""
+    if initial.free_log_evidence is not None:
+        return initial
+    lit, columns = initial.clock.on_grid(initial.posteriors.lit), np.arange(len(initial.snr))
+    trust, light_spread = initial.best_confidence(), acquisition.screen.light_spread
+    tails = channel.estimate_tails(initial.samples, initial.clock, initial.model, lit, trust, light_spread)
+    if not tails[0]:
+        return initial
+    model = initial.model.with_tails(light_spread, tails)
+    found = channel.slot_likelihoods(initial.samples, initial.clock, model, lit, columns, is_initial=True)
+    return replace(_with_metrics(initial, columns, found.metrics, found.snr), model=model)
 
 
 def initial_pass(acquisition: Acquisition) -> Reception:
@@ -294,7 +317,7 @@ def _view(
     model = replace(
         reception.model,
         noise=reception.model.noise.of_mean(1 / larger),
-        crosstalk=Crosstalk.of(n_strips, acquisition.screen.light_spread),
+        crosstalk=Crosstalk.of(n_strips, acquisition.screen.light_spread, reception.model.tails[0]),
         exposure=Exposure.of(clock.exposure_slots, samples_per_slot),
     )
     return samples, model

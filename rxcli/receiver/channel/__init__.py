@@ -21,7 +21,7 @@ converts slots and metrics between the frame's grid and bursts.
 """
 
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods
-from rxcli.receiver.channel.model import ObservationModel, estimate_black_level
+from rxcli.receiver.channel.model import ObservationModel, estimate_black_level, estimate_tails
 from rxcli.receiver.channel.patterns import by_burst, initial_metrics, metrics_of
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "SlotLikelihoods",
     "by_burst",
     "estimate_black_level",
+    "estimate_tails",
     "initial_metrics",
     "metrics_of",
     "slot_likelihoods",

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import TINY, box_sums
+from rxcli.protocol import SLOTS_PER_SYMBOL
+from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, sees_dark_header
-from rxcli.types import Clock, Float32Array, SlotSamples
+from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
+
+#: Columns whose differences give a standard deviation of two parameters.
+_MIN_COLUMNS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +27,12 @@ class ObservationModel:
     noise: NoiseModel
     crosstalk: Crosstalk
     exposure: Exposure
+    #: Tails of the crosstalk, see `Crosstalk.of`, with their standard deviation.
+    tails: tuple[float, float] = (0.0, 0.0)
+
+    def with_tails(self, light_spread: float, tails: tuple[float, float]) -> ObservationModel:
+        """The model with other tails of a column's light, whose standard deviation is `light_spread` pitches."""
+        return replace(self, tails=tails, crosstalk=Crosstalk.of(len(self.crosstalk.shares), light_spread, tails[0]))
 
     def expected(self, lit: Float32Array, clock: Clock, columns: NDArray[np.int64], slope: bool = False) -> Expected:
         """Predict the light of some columns per unit of picture, given the current estimate of all slots.
@@ -71,3 +83,59 @@ def estimate_black_level(samples: SlotSamples, clock: Clock) -> float:
     dark = sees_dark_header(places % clock.packet_slots, clock.exposure_slots, min_reach=0.5)
     observed = samples.light[..., dark][samples.valid[..., dark] > 0]
     return float(np.median(observed)) if observed.size else 0.0
+
+
+def estimate_tails(
+    samples: SlotSamples,
+    clock: Clock,
+    model: ObservationModel,
+    lit: Float32Array,
+    trust: FloatArray,
+    light_spread: float,
+) -> tuple[float, float]:
+    """Tails of the crosstalk by which the light of columns follows the slots of their neighbours.
+
+    Light over its local mean is compared with what crosstalk without and with tails gives for the decided slots. A
+    priori there are none.
+
+    Args:
+        samples: of all columns.
+        clock: the clock.
+        model: the light model.
+        lit: (C, N) probability that each slot is lit.
+        trust: (C,) probability that the slots of a column are right.
+        light_spread: standard deviation of the profile's light, column pitches.
+
+    Returns:
+        Tails and their standard deviation; zeros where they do not differ from none.
+    """
+    columns = np.flatnonzero(trust > SETTINGS.min_trust)
+    if columns.size < _MIN_COLUMNS:
+        return 0.0, 0.0
+    around, valid = SLOTS_PER_SYMBOL * samples.samples_per_slot, samples.valid[columns]
+    count = np.maximum(box_sums(valid, around), 1)
+
+    def over_mean(light: Float32Array) -> tuple[Float32Array, Float32Array]:
+        mean = np.asarray(box_sums(light * valid, around) / count, np.float32)
+        return np.asarray(light / np.maximum(mean, np.float32(TINY)), np.float32), mean
+
+    shown, mean = over_mean(model.over_black(samples)[columns])
+    near, wide = (
+        model.with_tails(light_spread, (tails, 0.0)).expected(lit, clock, columns).whole for tails in (0.0, 1.0)
+    )
+    plain = over_mean(near)[0]
+    # A tone or an exposure that is not quite the stated one bends the light between dark and lit, as tails do.
+    bent = over_mean(np.maximum(near, np.float32(TINY)) ** np.float32(SETTINGS.bent))[0]
+    changes = np.stack([over_mean(wide)[0] - plain, bent - plain])
+    noise = model.noise.variance(mean * shown) / np.maximum(np.square(mean), np.float32(TINY))
+    weight = valid * (mean > model.noise.sigma) / (noise + np.float32(SETTINGS.tails_texture**2))
+    weighted = changes * weight * trust[columns, None, None].astype(np.float32)
+    power = np.einsum("icsn,jcsn->cij", weighted, changes, dtype=np.float64)
+    error = np.einsum("icsn,csn->ci", weighted, shown - plain, dtype=np.float64)
+    inverse = np.linalg.inv(power.sum(axis=0) + TINY * np.eye(2))
+    fitted = inverse @ error.sum(axis=0)
+    scores = (error - power @ fitted) @ inverse
+    tails, variance = float(fitted[0]), float(np.square(scores[:, 0]).sum())
+    shrink = SETTINGS.tails_sd**2 / (SETTINGS.tails_sd**2 + variance)
+    tails, sd = shrink * tails, float(np.sqrt(shrink * variance))
+    return (tails, sd) if tails > SETTINGS.sure_tails * sd else (0.0, 0.0)

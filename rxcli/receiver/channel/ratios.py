@@ -63,7 +63,7 @@ def burst_samples(
         noise=np.where(visible > 0, lanes(variance), np.float32(1)),
         valid=visible,
         neighbours=lanes(neighbours),
-        own=np.tile(crosstalk.shares[:, 1].astype(np.float32), int(np.bincount(clock.burst).max())),
+        own=np.tile(crosstalk.own.ravel(), int(np.bincount(clock.burst).max())),
         exposure_slots=clock.exposure_slots,
         log_scale=scale,
         n_bursts=int(clock.burst.max()) + 1,

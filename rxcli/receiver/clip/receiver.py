@@ -258,7 +258,7 @@ def _receive_anew(
         return Lost(known), view, report
     with timer("sampling"):
         place = replace(acquired.context, sampled_corners=located.context.sampled_corners)
-        scene = TrackedScreen(place, acquisition, reception.model.black_level, named=options.corners is not None)
+        scene = TrackedScreen(place, acquisition, reception.model, named=options.corners is not None)
         view.light, view.pose = scene.strips(frame), scene.pose
     scene.update(view, lambda: reception.clock.on_grid(reception.posteriors.lit))
     return Tracking(known, scene), view, report

@@ -11,7 +11,7 @@ import numpy as np
 from rxcli.numerics import TINY
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import plane
-from rxcli.receiver.channel import SlotLikelihoods, by_burst, known_picture
+from rxcli.receiver.channel import ObservationModel, SlotLikelihoods, by_burst, known_picture
 from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import Pose, View
@@ -34,14 +34,14 @@ class TrackedScreen:
     Args:
         context: the frame that it begins with.
         acquisition: of that frame.
-        black_level: light of a dark slot there.
+        model: light model of that frame.
         named: whether the user gave the corners.
     """
 
-    def __init__(self, context: FrameContext, acquisition: Acquisition, black_level: float, named: bool) -> None:
+    def __init__(self, context: FrameContext, acquisition: Acquisition, model: ObservationModel, named: bool) -> None:
         frame, corners, tone = context.frame, context.sampled_corners, context.camera.tone
         self._lens, self._named, self._acquisition = context.camera.lens, named, acquisition
-        self._black_level = black_level
+        self._black_level, self._tails = model.black_level, model.tails[0]
         column_px = float(np.linalg.norm(corners[1] - corners[0])) / acquisition.screen.columns
         self._n_strips = min(plane.strips_per_column(column_px), SETTINGS.max_strips)
         outlines = self._outlines(frame, corners)
@@ -188,7 +188,7 @@ class TrackedScreen:
     def _new_picture(self) -> known_picture.KnownPicture:
         strips, profiles = self._first_pose.map, self._acquisition.profiles
         noise = NoiseModel(max(profiles.noise_floor, MIN_VARIANCE * strips.pixels), profiles.noise_slope)
-        crosstalk = Crosstalk.of(self._n_strips, self._acquisition.screen.light_spread)
+        crosstalk = Crosstalk.of(self._n_strips, self._acquisition.screen.light_spread, self._tails)
         return known_picture.KnownPicture(
             strips.inside.shape, crosstalk, self._black_level, noise.of_mean(strips.pixels)
         )

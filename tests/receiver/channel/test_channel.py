@@ -291,3 +291,29 @@ def test_metrics_of_copies_are_added(isi_memory: int) -> None:
     # The header after a copy tells of the copy's last slots: its first metrics are added at the end.
     np.testing.assert_allclose(found[0, :, 70], metrics[:, 37] + metrics[:, 107] + metrics[:, 177])
     assert (found[:, :, :isi_memory] == 0).all()
+
+
+@pytest.mark.parametrize("tails", [0.0, 0.4])
+@pytest.mark.parametrize(("n_wrong", "bent"), [(0, 1.0), (2, 1.0), (0, 1.2), (2, 0.8)])
+def test_tails_of_the_crosstalk_by_decided_slots(tails: float, n_wrong: int, bent: float) -> None:
+    rng, n_columns, n_slots, n_strips, spread = np.random.default_rng(4), 12, 240, 4, 0.45
+    lit = rng.integers(0, 2, (n_columns, n_slots)).astype(np.float32)
+    clock = Clock(5.0, 0.8, 70, 0.0, n_slots, 0, np.zeros(4, np.int64), np.zeros(n_columns), 10.0)
+    model = channel.ObservationModel(
+        0.02, NoiseModel(1e-5, 0.0), Crosstalk.of(n_strips, spread), Exposure.of(clock.exposure_slots, 2)
+    )
+    every = np.arange(n_columns)
+    light = model.with_tails(spread, (tails, 0.0)).expected(lit, clock, every).whole
+    picture = 0.3 * (1 + 0.2 * rng.standard_normal((n_columns, n_strips, 1)))
+    light = 0.02 + picture * light**bent + 3e-3 * rng.standard_normal(light.shape)
+    samples = SlotSamples(light.astype(np.float32), np.ones_like(light, np.float32), 2)
+    decided = lit.copy()
+    decided[:n_wrong] = 1 - decided[:n_wrong]
+    trust = np.where(every < n_wrong + 1, 0.05, 0.9)
+    estimate, sd = channel.estimate_tails(samples, clock, model, decided, trust, spread)
+    assert abs(estimate - tails) < 0.06
+    assert sd < 0.05
+    assert channel.estimate_tails(samples, clock, model, decided, 1.0 * (every < 2), spread) == (0.0, 0.0)
+    wide = model.with_tails(spread, (estimate, sd)).crosstalk.shares
+    np.testing.assert_allclose(wide.sum(axis=1), 1)
+    assert (wide[:, 1] < 0.97 * model.crosstalk.shares[:, 1]).all() == bool(tails)
