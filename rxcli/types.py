@@ -417,6 +417,10 @@ class FrameSoftBits:
     source: str = ""
     frame: int = 0
     time_s: float = 0.0
+    #: Whether no header shows where packets start: the symbols in view may be any of their packet, in this order.
+    open_start: bool = False
+    #: The same picture read with other, less likely clocks.
+    alternatives: tuple[FrameSoftBits, ...] = ()
 
 
 MessageKind = Literal["raw", "text", "uri"]

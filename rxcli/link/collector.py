@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ from rxcli.link.placement import Placement, placed
 from rxcli.link.receiver import LinkReceiver
 from rxcli.link.softbits import Event
 from rxcli.profiles import ScreenProfile
-from rxcli.types import FILE_MEMORY_MB, FrameResult, Message, ObjectProgress, ReceivedObject
+from rxcli.types import FILE_MEMORY_MB, FrameResult, FrameSoftBits, Message, ObjectProgress, ReceivedObject
 
 
 class Collector:
@@ -19,13 +20,13 @@ class Collector:
     What decodes shows how the picture's columns lie on the screen: mirrored, or numbered some columns off.
 
     Args:
-        screens: profiles that results may name.
+        screens: that may be seen.
         file_memory_mb: memory limit of all incomplete files, 2^20 bytes.
     """
 
     def __init__(self, screens: Sequence[ScreenProfile], file_memory_mb: int = FILE_MEMORY_MB) -> None:
         self._under_way = FilesUnderWay(file_memory_mb)
-        self._shapes = {screen.name: (screen.columns, screen.payload_symbols) for screen in screens}
+        self._shapes = {(screen.columns, screen.payload_symbols) for screen in screens}
         #: Receivers by columns and payload symbols.
         self._receivers: dict[tuple[int, int], LinkReceiver] = {}
         #: Placement of the source's columns; None until a message or file decides.
@@ -37,13 +38,17 @@ class Collector:
         soft, result = result.soft_bits, replace(result, soft_bits=None)
         if result.source != self._source:  # the next photo may come from a different camera
             self._source, self._placement = result.source, None
-        shape, events = self._shapes.get(result.screen_profile or ""), list[Event]()
-        if soft is not None and shape is not None and soft.llr.shape[1:3] == shape[::-1]:
+        events, by_shape = list[Event](), defaultdict[tuple[int, int], list[FrameSoftBits]](list)
+        for candidate in () if soft is None else (soft, *soft.alternatives):
+            by_shape[candidate.llr.shape[2], candidate.llr.shape[1]].append(candidate)
+        for shape, (likeliest, *less_likely) in by_shape.items():
+            if shape not in self._shapes:
+                continue
             if shape not in self._receivers:
                 self._receivers[shape] = LinkReceiver(*shape, self._under_way)
             receiver = self._receivers[shape]
             receiver.placement = self._placement
-            events = receiver.add(soft)
+            events += receiver.add(replace(likeliest, alternatives=tuple(less_likely)))
             self._placement = receiver.placement
         return with_events(result if self._placement is None else placed(result, self._placement), events)
 

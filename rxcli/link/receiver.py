@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.link.beacons import BeaconSearch
+from rxcli.link.cut_photos import CutPhotos
 from rxcli.link.files import FileSearch, FileState, FilesUnderWay
 from rxcli.link.formats import Container
 from rxcli.link.layout import LABEL_BITS
@@ -29,6 +30,7 @@ class LinkReceiver:
         self._under_way = FilesUnderWay() if under_way is None else under_way
         self._shape = (payload_symbols, columns, LABEL_BITS)
         self._beacons = BeaconSearch(columns, payload_symbols)
+        self._cut_photos = CutPhotos(columns, payload_symbols)
         self._files = FileSearch(columns, payload_symbols, self._under_way)
         self._last: FrameSoftBits | None = None
         #: Placement of the source's columns, None until a message or an announcement decides it.
@@ -48,12 +50,17 @@ class LinkReceiver:
         if soft.burst.size == 0:
             return []
         self._last = soft
-        events: list[Event] = [self._object(soft, *found) for found in self._files.add(soft, self.placement)]
-        announced = self._files.placement(soft.epoch)
-        if announced is not None:
-            self.placement = announced
-            return events
-        found = self._beacons.add(soft, self.placement)
+        events: list[Event] = []
+        found: list[tuple[tuple[MessageKind, bytes], Placement]] = []
+        if not soft.open_start:
+            events += [self._object(soft, *complete) for complete in self._files.add(soft, self.placement)]
+            announced = self._files.placement(soft.epoch)
+            if announced is not None:
+                self.placement = announced
+                return events
+            found = self._beacons.add(soft, self.placement)
+        if not found and (soft.source or soft.open_start):  # a photograph
+            found = self._cut_photos.add(soft)
         self.placement = found[-1][1] if found else self.placement
         return events + self._new_messages(soft, [message for message, _ in found])
 

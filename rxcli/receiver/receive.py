@@ -17,6 +17,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.in_common import named
 from rxcli.receiver.frame.passes import Reception, headerless, soft_bits
 from rxcli.receiver.frame.result import Failure, Received, failed
@@ -24,12 +25,13 @@ from rxcli.receiver.plane import in_one_mix
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.attempts import receive_either_way
+from rxcli.receiver.search.cut import cut_packets
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.outlines import no_screen, proposed_screens, too_small
 from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import Frame, FrameResult, OnTaps
+from rxcli.types import Frame, FrameResult, FrameSoftBits, OnTaps
 
 
 def receive(frames: Iterable[Frame], options: ReceiverOptions, on_taps: OnTaps | None = None) -> Iterator[FrameResult]:
@@ -120,7 +122,8 @@ def _receive_screen(
     # Search: where the columns are, what a row is in time, which screen and clock.
     found = search(cache, options, outlines=outlines)
     if isinstance(found, Failure):
-        return Received(failed(nothing, found), {})
+        cut = _cut_packets(found.context, options) if found.message != STEADY_LIGHT else None
+        return Received(replace(failed(nothing, found), soft_bits=cut), {})
     outline, context, acquisition = found.outline, found.best.context, found.best.acquisition
     camera = context.camera
     # Channel and decode, in turn: metrics of slots to symbols, and symbols to the picture.
@@ -159,11 +162,21 @@ def _receive_screen(
         skipped=reception.skipped,
         soft_bits=soft_bits(frame, reception, no_header, denoised) if options.soft_bits else None,
     )
+    if no_header.all() and not result.packets:
+        result = replace(result, soft_bits=_cut_packets(context, options) or result.soft_bits)
     if result.status == "no_signal":
         result = replace(result, message=too_small(context, acquisition.screen) or assemble.why_no_packet(columns))
     elif outline.column_offset is None:
         result = replace(result, message=result.numbering_remark)
     return Received(result, _taps(found, reception))
+
+
+def _cut_packets(context: FrameContext | None, options: ReceiverOptions) -> FrameSoftBits | None:
+    """Soft bits of a part of a packet without header, by a camera that is known; None if there are none."""
+    if context is None or context.camera.hypothesis is not None or not options.soft_bits:
+        return None
+    likeliest, *less_likely = cut_packets(context) or (None,)
+    return likeliest and replace(likeliest, alternatives=tuple(less_likely))
 
 
 def _taps(found: Found, reception: Reception) -> dict[str, Any]:

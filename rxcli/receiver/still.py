@@ -122,6 +122,11 @@ def initial_pass(acquisition: Acquisition) -> Reception:
     return Reception(clock, samples, contrast, posteriors, likelihoods.snr, model, likelihoods.metrics, joint)
 
 
+def detected_on(reception: Reception, clock: Clock) -> Reception:
+    """The initial pass with its slots at other places in their packets."""
+    return replace(reception, clock=clock, posteriors=detected(reception.metrics, clock))
+
+
 def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     """Make a pass that detects slots and picture jointly: first every copy by itself, then the copies of bursts."""
     clock = acquisition.clock
@@ -271,8 +276,8 @@ def as_one_column(reception: Reception) -> Reception:
 
 
 def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
-    """Columns with a complete packet of low confidence."""
-    doubtful = (reception.packet_confidence < STILL.doubtful) & reception.is_complete
+    """Columns with a complete packet of low confidence; where no packet is complete, all columns."""
+    doubtful = (reception.packet_confidence < STILL.doubtful) & (reception.is_complete | ~reception.is_complete.any())
     return np.flatnonzero(doubtful.any(axis=0))
 
 

@@ -15,10 +15,10 @@ from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, FrameSoftBits, IntArray
 
 
-def observed_symbols(n_observed: IntArray) -> BoolArray:
-    """(..., N) whether all slots of a payload symbol were observed, from counts (..., packet)."""
-    payload = n_observed[..., PREAMBLE_SLOTS:] > 0
-    return np.asarray(payload.reshape(*payload.shape[:-1], -1, SLOTS_PER_SYMBOL).all(axis=-1))
+def in_view(n_observed: IntArray, max_missing: int = 0) -> BoolArray:
+    """(..., N) whether at most some slots of a payload symbol were not observed, from counts (..., packet)."""
+    missing = n_observed[..., PREAMBLE_SLOTS:] == 0
+    return np.asarray(missing.reshape(*missing.shape[:-1], -1, SLOTS_PER_SYMBOL).sum(axis=-1) <= max_missing)
 
 
 def assume_unobserved_certain(posteriors: BurstPosteriors, n_observed: IntArray) -> BurstPosteriors:
@@ -28,7 +28,7 @@ def assume_unobserved_certain(posteriors: BurstPosteriors, n_observed: IntArray)
         posteriors: of B bursts and C columns.
         n_observed: (B, C, packet).
     """
-    return replace(posteriors, log_prob=np.where(observed_symbols(n_observed), posteriors.log_prob, 0.0))
+    return replace(posteriors, log_prob=np.where(in_view(n_observed), posteriors.log_prob, 0.0))
 
 
 def llr_limits(posteriors: BurstPosteriors, n_observed: IntArray, log_odds: FloatArray) -> FloatArray:
@@ -39,7 +39,7 @@ def llr_limits(posteriors: BurstPosteriors, n_observed: IntArray, log_odds: Floa
         n_observed: (B, C, packet).
         log_odds: (B, C) calibrated log-odds that every observed symbol is right.
     """
-    known = observed_symbols(n_observed)[..., None] & ~np.isnan(posteriors.bit_llr)
+    known = in_view(n_observed)[..., None] & ~np.isnan(posteriors.bit_llr)
     n_bits = np.maximum(known.sum(axis=(-2, -1)), 1)
     wrong = wrong_share(log_odds, n_bits)
     own = (known / (1 + np.exp(np.abs(np.nan_to_num(posteriors.bit_llr))))).sum(axis=(-2, -1)) / n_bits
@@ -73,7 +73,12 @@ def still_soft_bits(
     """
     limits = llr_limits(posteriors, n_observed, confidence_log_odds(confidence_features))
     erased = echoes(posteriors, snr_db) | headerless
-    return FrameSoftBits(np.arange(len(n_observed)), limit_llr(posteriors, limits, erased))
+    # The joint detector leaves one word of a symbol that is hardly in view, as if the others were impossible.
+    llr = (
+        limit_llr(posteriors, limits, erased)
+        * in_view(n_observed, SETTINGS.max_missing_slots).swapaxes(1, 2)[..., None]
+    )
+    return FrameSoftBits(np.arange(len(n_observed)), llr)
 
 
 def clip_soft_bits(bursts: Sequence[BurstInClip], snr_db: Sequence[float | None], epoch: int) -> FrameSoftBits | None:

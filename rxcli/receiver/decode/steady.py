@@ -34,7 +34,9 @@ def is_steady(value: Float32Array, weight: Float32Array, lit: Float32Array, pack
     level = (value - _mean(value, observed)) * observed
     if not level.any():
         return False
-    steady = periodic_share(level, packet_slots * samples_per_slot)
+    # A period of more than half of what is visible explains anything.
+    n_visible = int(np.count_nonzero(observed.any(axis=0)))
+    steady = periodic_share(level, min(packet_slots * samples_per_slot, n_visible))
     return steady > SETTINGS.min_periodic_share and steady > _share_of_slots(level, observed, lit, samples_per_slot)
 
 

@@ -59,6 +59,14 @@ class SearchSettings:
     #: Largest size of an outline relative to the picture, beyond which less than one column is visible.
     largest_outline: float = 50.0
 
+    #: Pictures that show no header: fewest symbols in view, phases of a slot that are tried, clocks that are decoded
+    #: and that are handed on, and log evidence by which a start with a part of the header in view must lead.
+    cut_symbols: int = 2
+    cut_phases: int = 4
+    cut_clocks: int = 6
+    max_cut: int = 3
+    cut_start: float = 10.0
+
     #: Largest shift of the light of one lamp between columns, slots: blinds may be slanted.
     max_column_shift_slots: int = 10
     #: Detection of switched light without a clock: smoothing and longest period, rows; minimum explained share.

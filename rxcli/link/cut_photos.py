@@ -1,0 +1,111 @@
+"""Photographs of a text that show packets in part: which of its symbols each shows is found with the text itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from rxcli.link.beacons import gathered, read_words
+from rxcli.link.formats import unprotect_beacon
+from rxcli.link.layout import BEACON_LENGTHS, beacon_layout
+from rxcli.link.placement import Placement, possible_placements
+from rxcli.link.softbits import Float32, information, surprise
+from rxcli.types import FrameSoftBits, MessageKind
+
+Found = tuple[tuple[MessageKind, bytes], Placement]
+#: Largest number of sums of photographs that are kept, of ways to read one, and of sums that are decoded at once.
+_MAX_SUMS, _MAX_VIEWS, _BATCH = 192, 96, 64
+#: Log-likelihood ratio below which photographs do not show the same text; and from which they certainly do.
+_MIN_SIMILARITY, _SAME = -8.0, 16.0
+#: Information at which a text is decoded, relative to its bits; and log-likelihood ratio below which a bit is unknown.
+_TRY_FROM, _UNKNOWN = 1.02, 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sum:
+    """Soft bits of a packet (N, C, 7), of one photograph or of several under one hypothesis of what they show."""
+
+    total: Float32
+    #: Log-likelihood ratio of all photographs showing one text; and the sum of `surprise` over all bits.
+    similarity: float
+    level: float
+    #: Of the last photograph.
+    placement: Placement
+
+
+class CutPhotos:
+    """Search for texts that every burst repeats, in photographs of a part of a packet.
+
+    Args:
+        columns: C.
+        payload_symbols: N.
+    """
+
+    def __init__(self, columns: int, payload_symbols: int) -> None:
+        layouts = (beacon_layout(length, columns, payload_symbols) for length in BEACON_LENGTHS)
+        self._layouts = [layout for layout in layouts if layout.period == 1]
+        self._sums: list[_Sum] = []
+
+    def add(self, soft: FrameSoftBits) -> list[Found]:
+        """Add a photograph, and return the text that it completes with the placement of its columns."""
+        views = list(_views(soft))[:_MAX_VIEWS]
+        joined = [pair for known in self._sums for view in views if (pair := _joined(known, view)) is not None]
+        # Sums of more photographs first: without an overlap nothing speaks for one or another.
+        sums = [*sorted(joined, key=lambda s: -s.similarity), *views]
+        certain = [s for s in joined if s.similarity > _SAME]
+        self._sums = (certain and sorted(certain, key=lambda s: -s.similarity)[:_MAX_SUMS]) or [
+            *sums[:_MAX_SUMS],
+            *self._sums,
+        ][: 2 * _MAX_SUMS]
+        for layout in self._layouts:
+            found = next(self._read(layout.length, sums[: 2 * _MAX_SUMS]), None)
+            if found is not None:
+                self._sums = [found[1]]
+                return [(found[0], found[1].placement)]
+        return []
+
+    def _read(self, length: int, sums: list[_Sum]) -> Iterator[tuple[tuple[MessageKind, bytes], _Sum]]:
+        """Texts of a length that sums show."""
+        layout = next(layout for layout in self._layouts if layout.length == length)
+        for start in range(0, len(sums), _BATCH):
+            part = sums[start : start + _BATCH]
+            buffers = np.stack([gathered(layout, s.total[None]) for s in part])
+            which = np.flatnonzero(information(buffers).sum(axis=1) > _TRY_FROM * layout.code.k)
+            words = read_words(layout, buffers[which]) if which.size else []
+            for place, word in zip(which.tolist(), words, strict=True):
+                found = None if word is None else unprotect_beacon(word)
+                if found is not None:
+                    yield found, part[place]
+
+
+def _views(soft: FrameSoftBits) -> Iterator[_Sum]:
+    """What a photograph may show: every clock, start of its packets and placement of its columns, likeliest first."""
+    for group in range(3):
+        for candidate in (soft, *soft.alternatives):
+            llr = np.where(np.abs(candidate.llr) > _UNKNOWN, candidate.llr, 0).sum(axis=0, dtype=np.float32)
+            observed, groups = np.flatnonzero(llr.any(axis=(1, 2))), possible_placements(llr)
+            if observed.size == 0 or group >= len(groups):
+                continue
+            starts = range(-int(observed[0]), len(llr) - int(observed[-1])) if candidate.open_start else (0,)
+            for start in starts:
+                # Symbols outside those in view are unknown, so that nothing is lost at the ends.
+                moved = np.roll(llr, start, axis=0)
+                for placement in groups[group]:
+                    total = placement.of(moved)
+                    yield _Sum(total, 0.0, _level(total), placement)
+
+
+def _level(total: Float32) -> float:
+    return float(surprise(total).sum(dtype=np.float64))
+
+
+def _joined(known: _Sum, view: _Sum) -> _Sum | None:
+    """The sum of both, or None if they contradict each other."""
+    total = known.total + view.total
+    level = _level(total)
+    gain = level - known.level - view.level
+    if gain < _MIN_SIMILARITY:
+        return None
+    return _Sum(total, known.similarity + gain, level, view.placement)

@@ -1,0 +1,95 @@
+"""Texts of photographs that show a part of a packet and no header: the code finds which part."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rxcli.lab.benchmark.goodput import detect
+from rxcli.lab.benchmark.trial import simulate_trial
+from rxcli.lab.simulate.population import Population
+from rxcli.link.collector import Collector
+from rxcli.link.encoder import message
+from rxcli.link.placement import Placement
+from rxcli.link.receiver import LinkReceiver
+from rxcli.options import ReceiverOptions
+from rxcli.receiver.decode.soft_bits import in_view
+from rxcli.receiver.decode.steady import is_steady
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.receive import _receive_still
+from rxcli.types import FrameSoftBits
+
+COLUMNS, SYMBOLS, TEXT = 20, 11, "Platform 4: the 10:42 leaves here"
+NO = Placement()
+
+
+def photo(symbols: range, rng: np.random.Generator, placement: Placement = NO, number: int = 0) -> FrameSoftBits:
+    """Some symbols of a packet, counted from the first in view; a clock under which they look random is likelier."""
+    llr = np.zeros((1, SYMBOLS, COLUMNS, 7), np.float32)
+    sent = message(TEXT).labels(np.arange(1), COLUMNS, SYMBOLS)
+    llr[:, : len(symbols)] = detect(sent, 5, (9.0,) * COLUMNS, rng)[:, list(symbols)]
+    wrong = np.zeros_like(llr)
+    wrong[:, : len(symbols)] = rng.normal(0, 1, (1, len(symbols), COLUMNS, 7))
+    read = FrameSoftBits(np.arange(1), placement.inverse.of(llr), open_start=True)
+    return replace(read, llr=wrong, alternatives=(read,), epoch=number, source=f"{number}")
+
+
+@pytest.mark.parametrize("placement", [NO, Placement(True)])
+@pytest.mark.parametrize("first", [0, 2])
+def test_one_photo_that_shows_most_of_a_packet_gives_its_text(first: int, placement: Placement) -> None:
+    receiver = LinkReceiver(COLUMNS, SYMBOLS)
+    [got] = receiver.add(photo(range(first, first + 8), np.random.default_rng(first), placement))
+    assert got.text == TEXT  # type: ignore[union-attr]
+    assert receiver.placement == placement
+
+
+def test_photos_of_different_parts_add_up() -> None:
+    receiver, rng = LinkReceiver(COLUMNS, SYMBOLS), np.random.default_rng(3)
+    came = [receiver.add(photo(range(k, k + 5), rng, number=k)) for k in (1, 5)]
+    assert [len(events) for events in came] == [0, 1]
+    assert receiver.messages[0].text == TEXT
+
+
+def test_a_symbol_hardly_in_view_gives_no_soft_bits() -> None:
+    n_observed = np.ones((1, 1, 70), np.int64)
+    n_observed[..., 20:23] = n_observed[..., 68:] = 0
+    assert in_view(n_observed, 2).tolist() == [[[False, True, True, True, True]]]
+
+
+def test_no_period_explains_light_that_is_shorter_than_two_of_it() -> None:
+    rng = np.random.default_rng(5)
+    lit = np.repeat(rng.integers(0, 2, (8, 1, 57)), 1, axis=1)[:, 0].astype(np.float32)
+    value = 2 * np.repeat(lit, 2, axis=1) - 1
+    assert not is_steady(value, np.ones_like(value), np.roll(lit, 3, axis=1), 130)
+
+
+def test_noise_gives_no_text() -> None:
+    receiver, rng = LinkReceiver(COLUMNS, SYMBOLS), np.random.default_rng(4)
+    for number in range(3):
+        llr = np.zeros((1, SYMBOLS, COLUMNS, 7), np.float32)
+        llr[:, :7] = rng.normal(0, 5, (1, 7, COLUMNS, 7))
+        assert receiver.add(FrameSoftBits(np.arange(1), llr, number, f"{number}", open_start=True)) == []
+
+
+def test_a_picture_without_header_gives_its_text() -> None:
+    rng = np.random.default_rng(4)
+    drawn = Population(
+        screens=("data-17k3",),
+        readout_s=(7e-3, 7e-3),
+        exposure_slots=(0.7, 0.7),
+        packets=(0.2, 0.95),
+        fill=(0.75, 0.75),
+        width_px=(900, 900),
+        aim=0,
+    )
+    scene, _ = drawn.draw(rng)
+    scene = replace(scene, labels=message("hello there"), start_slot=12.0, w=5)
+    trial = simulate_trial(scene, 1)
+    known = ReceiverOptions(screens=(scene.screen,), cameras=(trial.camera,), force_camera=True, corners=trial.corners)
+    result = _receive_still(FrameCache(trial.frame), replace(known, soft_bits=True)).result
+    assert not result.packets
+    assert result.soft_bits is not None
+    assert result.soft_bits.open_start
+    assert [m.text for m in Collector([scene.screen]).add(result).messages] == ["hello there"]
