@@ -240,7 +240,8 @@ def _receive_anew(
         reception = decode(acquisition, options.skip, acquired.initial, adds_up=True)
     with timer("denoise"):
         reception, denoised, report = apply_autoencoder(acquisition, reception, options)
-    if ledger.start is None and shows_steady_light(reception):
+    is_long = reception.free_log_evidence is not None  # Arbitrary slots were compared with packets already.
+    if ledger.start is None and not is_long and shows_steady_light(reception):
         return Lost(known), Failure("no_signal", STEADY_LIGHT), None
     if assemble.all_dark(reception.snr):
         return Lost(known), Failure("no_signal", _NOTHING_LIT), None
