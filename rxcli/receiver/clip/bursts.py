@@ -68,18 +68,18 @@ class Burst:
         """What is reported of it; `view` is of the last frame that shows it."""
         assert view.numbers is not None
         features = against = None
-        is_long = view.acquisition.clock.exposure_slots > SYNC.long_exposure_slots
         if self.tracked:
             decided = np.sign(self.posteriors.lit[0, :, PREAMBLE_SLOTS:] - 0.5)
             against = np.maximum(-self._llr[0, :, PREAMBLE_SLOTS:] * decided, 0).max(axis=1)
         else:
             margin = detect.slot_margin(self.metrics[None], self.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
+            is_long = view.acquisition.clock.exposure_slots > SYNC.long_exposure_slots
             undenoised, joint = np.zeros(margin.shape[1], bool), np.full(margin.shape[1], is_long)
             n_strips = view.acquisition.binned.light.shape[1]
             features = confidence.confidence_features(self.posteriors, margin, undenoised, n_strips, joint)[0]
         index = self.number - int(view.numbers[0])
         return confidence.BurstInClip(
-            self.number, index, self.posteriors, self.n_observed, self.frames, features, against, is_long
+            self.number, index, self.posteriors, self.n_observed, self.frames, features, against
         )
 
 

@@ -36,7 +36,6 @@ class _Photographs(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class _Clips(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: tuple[float, ...]
-    long_weights: tuple[float, ...]
     max_log_odds: float
 
 
@@ -78,8 +77,6 @@ class BurstInClip:
     #: (C,) largest log-likelihood of any payload slot against its decision; None where the frames were received like
     #: photographs.
     against: Float32Array | None
-    #: Whether exposures last several slots.
-    is_long: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +137,7 @@ def clip_log_odds(burst: BurstInClip) -> FloatArray:
     """(1, C) calibrated log-odds of the packets of a burst of a clip being error-free."""
     if burst.confidence_features is not None:
         return confidence_log_odds(burst.confidence_features[None])
-    model = confidence_model().clips
-    return np.asarray(clip_features(burst)[None] @ np.array(model.long_weights if burst.is_long else model.weights))
+    return np.asarray(clip_features(burst)[None] @ np.array(confidence_model().clips.weights))
 
 
 def clip_features(burst: BurstInClip) -> FloatArray:
