@@ -70,7 +70,9 @@ def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception, *
     """
     reception = initial = _with_tails(acquisition, initial)
     n_columns = len(initial.snr)
-    candidates = doubtful_columns(initial) if "certain_columns" in skip else np.arange(n_columns)
+    # The initial pass is too sure where samples show more than two slots.
+    is_short = adds_up or initial.model.exposure.isi_memory == 1
+    candidates = doubtful_columns(initial) if "certain_columns" in skip and is_short else np.arange(n_columns)
     lit = candidates[~dark_columns(initial.snr)[candidates]] if "dark_columns" in skip else candidates
     skipped = {"certain_columns": n_columns - candidates.size, "dark_columns": candidates.size - lit.size}
     # Joint detection gives no metrics, and developing mixes rows that are few per slot.
@@ -194,11 +196,11 @@ def follow_picture(acquisition: Acquisition, reception: Reception, columns: NDAr
         prior = np.maximum(reception.posteriors.w_log_prob[columns], STILL.min_weight_log_prior) / bursts.n_bursts
         bursts = replace(bursts, w_log_prior=np.tile(prior, (bursts.n_bursts, 1)))
     found = survivors.detect(bursts)
-    found = replace(
-        found,
-        header_llr=reception.posteriors.header_llr[:, columns],
-        log_evidence=reception.posteriors.log_evidence[columns],
-    )
+    header_llr, log_prob = reception.posteriors.header_llr[:, columns], found.log_prob
+    if is_long:  # Where arbitrary slots explain a column as well, it may have no packets.
+        log_prob = log_prob - np.logaddexp(0, -header_llr.sum(axis=0))[None, :, None] / log_prob.shape[2]
+    log_evidence = reception.posteriors.log_evidence[columns]
+    found = replace(found, header_llr=header_llr, log_evidence=log_evidence, log_prob=log_prob)
     joint = reception.joint.copy()
     joint[columns] = True
     return replace(reception, posteriors=reception.posteriors.with_columns(columns, found), joint=joint)
