@@ -74,7 +74,8 @@ def propose(
     level *= weight
     bends = [np.zeros(4)] + ([likeliest_bend(coarse, level)] if may_bend else [])
     found = [clock for bend in bends for clock in _clocks(coarse, level, bend, width, exposures)]
-    smeared = _distinct(_smeared_clocks(strips, exposures, may_bend=may_bend))
+    is_short = exposure_s is not None and max(exposures.values()) <= SETTINGS.long_exposure_slots
+    smeared = [] if is_short else _distinct(_smeared_clocks(strips, exposures, may_bend=may_bend))
     if smeared:  # Stripes as wide as those of the longest exposures are of no short one.
         found = [clock for clock in found if clock.exposure_slots < SETTINGS.long_exposure_slots]
     short = _distinct(clock for clock in found if not any(_is_same(clock, better) for better in smeared))
