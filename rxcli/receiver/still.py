@@ -234,7 +234,7 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
     light = reception.samples.light[reception.samples.valid > 0]
     levels = [float(np.percentile(light, STILL.dark_percent)) * share for share in STILL.dark_shares]
     level = levels[int(evidence(clock, levels).sum(axis=1).argmax())]
-    ways = [way for way, _, _ in sync.possible_bursts(clock, slot_llr(reception.metrics), acquisition.repeats)]
+    ways = [way for way, _ in sync.possible_bursts(clock, slot_llr(reception.metrics), acquisition.repeats)]
     gains = np.concatenate([evidence(way, [level]) for way in ways])
     most = STILL.max_column_gain
     best = ways[int(np.clip(gains - gains[0], -most, most).sum(axis=1).argmax())]
@@ -257,17 +257,15 @@ def _exposed_for(clock: Clock, factor: float) -> Clock:
 def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[tuple[Reception, float]]:
     """Receptions with the copies assigned to bursts in other ways; none if the similarity of copies leaves no doubt.
 
-    Each comes with the log-likelihood by which its copies are less similar.
+    Each comes with the log-odds by which its copies are less likely so by themselves.
     """
     if reception.free_log_evidence is not None:
         return
-    (_, similarity, _), *rivals = sync.possible_bursts(
-        reception.clock, slot_llr(reception.metrics), acquisition.repeats
-    )
-    for clock, rival_similarity, _ in rivals:
-        if similarity - rival_similarity <= SETTINGS.plain_bursts or not reception.is_complete.any():
+    (_, log_weight), *rivals = sync.possible_bursts(reception.clock, slot_llr(reception.metrics), acquisition.repeats)
+    for clock, rival_log_weight in rivals:
+        if log_weight - rival_log_weight <= SETTINGS.plain_bursts or not reception.is_complete.any():
             rival = replace(reception, clock=clock, posteriors=detected(reception.metrics, clock))
-            yield rival, similarity - rival_similarity
+            yield rival, log_weight - rival_log_weight
 
 
 def as_one_column(reception: Reception) -> Reception:

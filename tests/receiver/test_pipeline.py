@@ -505,7 +505,7 @@ def test_packets_determine_the_bursts_where_the_similarity_of_copies_leaves_doub
     possible_bursts = still.sync.possible_bursts
 
     def least_similar_first(*given: Any) -> list[tuple[Clock, float]]:
-        return [(clock, 0.0, 0.5) for clock, _, _ in reversed(possible_bursts(*given))]
+        return [(clock, 0.0) for clock, _ in reversed(possible_bursts(*given))]
 
     monkeypatch.setattr(still.sync, "possible_bursts", least_similar_first)
     assert not np.array_equal(initial_pass(best.acquisition).clock.burst, right)

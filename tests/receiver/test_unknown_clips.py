@@ -60,11 +60,13 @@ def test_the_camera_is_estimated_once_and_refitted(clip: Clip, monkeypatch: pyte
     assert results[-1].estimated == results[0].estimated
 
 
-def test_frames_of_half_a_packet_show_together_which_screen_it_is() -> None:
-    """Each leaves open whether it shows a whole packet of another screen; their times do not."""
+@pytest.mark.parametrize("named", [False, True])
+def test_frames_of_half_a_packet_show_together_which_screen_it_is(named: bool) -> None:
+    """Each leaves open whether it shows a whole packet of another screen; their times do not, nor does a name."""
     clip = simulate(5, 7, screen="data-17k3", repeats=1, readout_s=5.1e-3)
     frames = [replace(frame, time_s=frame.index * 1001 / 60000) for frame in clip.frames]
-    results = list(receive(frames, replace(_unknown(clip), screens=ReceiverOptions().screens)))
+    options = _unknown(clip)
+    results = list(receive(frames, options if named else replace(options, screens=ReceiverOptions().screens)))
     assert all(result.screen_profile in ("data-17k3", "paper-17k3") for result in results)
     assert not any(packet.is_believable for result in results for packet in result.packets)
     assert results[-1].line_delay_s == pytest.approx(_line_delay_s(clip), rel=1e-3)

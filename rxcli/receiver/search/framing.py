@@ -84,7 +84,7 @@ def framing_of(acquisition: Acquisition, reception: Reception, screens: Sequence
     log_weight = np.array([_log_weight(reception, *framing) for each in framings.values() for framing in each])
     weight = np.exp(log_weight - log_weight.max())
     of_ways = weight[: 1 + len(rivals)] / weight.sum()
-    ways = np.array([clock.burst for clock, _, _ in (likeliest, *rivals)])
+    ways = np.array([clock.burst for clock, _ in (likeliest, *rivals)])
     places = own.to_copies(np.ones(own.n_slots, bool))
     counts, bursts = places[:, PREAMBLE_SLOTS:].any(axis=1), np.zeros(int(own.burst.max()) + 1)
     for burst in range(bursts.size):
@@ -100,8 +100,8 @@ def _framed(own: Clock, header: int, length: int) -> Clock:
     return replace(own, packet_slots=length, first_slot=first_slot, burst=np.zeros(n_copies, np.int64))
 
 
-def _log_weight(reception: Reception, clock: Clock, similarity: float, prior: float) -> float:
+def _log_weight(reception: Reception, clock: Clock, of_copies: float) -> float:
     """Log-likelihood of a framing and its prior."""
     posteriors = detected(reception.metrics, clock)
     framed = replace(reception, clock=clock, posteriors=posteriors, free_log_evidence=None)
-    return SETTINGS.temper * evidence.log_evidence(framed) + similarity + float(np.log(prior / clock.packet_slots))
+    return SETTINGS.temper * evidence.log_evidence(framed) + of_copies - float(np.log(clock.packet_slots))

@@ -275,4 +275,4 @@ def _in_likeliest_bursts(scored: Scored) -> Scored:
     for reception, behind in in_other_bursts(acquisition, scored.reception):
         ways.append((_rated(hypothesis, context, acquisition, reception), behind))
     # Not by score: it distrusts columns that send the same, and wrong bursts make them differ.
-    return max(ways, key=lambda way: evidence.tempered(way[0].reception, way[0].evidence) - way[1])[0]
+    return max(ways, key=lambda way: SETTINGS.temper * way[0].evidence - way[1])[0]

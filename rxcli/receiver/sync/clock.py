@@ -366,8 +366,8 @@ def sample_slots(
     return SlotSamples(light, valid, samples_per_slot)
 
 
-def possible_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> list[tuple[Clock, float, float]]:
-    """All assignments of the copies to bursts, the most similar copies first.
+def possible_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> list[tuple[Clock, float]]:
+    """All assignments of the copies to bursts, likeliest first.
 
     Args:
         clock: the clock.
@@ -375,15 +375,19 @@ def possible_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> 
         repeats: how many copies a burst may have.
 
     Returns:
-        Clocks, log-likelihood ratios of their copies against different ones, and prior probabilities.
+        Clocks, each with the log-likelihood ratio of its copies against different ones, plus its log prior.
     """
     scores = copy_similarity(llr, clock)
-    out: dict[bytes, tuple[Clock, float, float]] = {}
+    prior: dict[bytes, float] = {}
+    ways: dict[bytes, IntArray] = {}
     for n, burst in _assignments(clock.n_copies, repeats):
-        score, before = float(scores[burst[1:] == burst[:-1]].sum()), out.get(burst.tobytes())
-        prior = 1 / (n * len(repeats)) + (before[2] if before else 0.0)
-        out[burst.tobytes()] = replace(clock, burst=burst), score, prior
-    return sorted(out.values(), key=lambda assignment: -assignment[1])
+        key = ways.setdefault(burst.tobytes(), burst).tobytes()
+        prior[key] = prior.get(key, 0.0) + 1 / (n * len(repeats))
+    out = [
+        (replace(clock, burst=way), float(scores[way[1:] == way[:-1]].sum() + np.log(prior[key])))
+        for key, way in ways.items()
+    ]
+    return sorted(out, key=lambda assignment: -assignment[1])
 
 
 def likely_repeats(clock: Clock, repeats: Sequence[int]) -> int:

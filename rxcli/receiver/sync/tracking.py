@@ -177,7 +177,8 @@ class BurstPhase:
         #: (n, 2) hypotheses: copies of a burst, and phase.
         self._hypotheses = np.array([(n, phase) for n in candidates for phase in range(n)], np.int64)
         self._max_repeats = max(candidates)
-        self._score = np.zeros(len(self._hypotheses))
+        # Log prior: every phase of a number of copies is equally likely.
+        self._score = -np.log(self._hypotheses[:, 0])
         self._copies: dict[int, FloatArray] = {}
 
     @property
@@ -202,7 +203,7 @@ class BurstPhase:
         """Probability that some copies, by their numbers in the clip, are one packet."""
         repeats, phases = self._hypotheses.T
         bursts = (copies[:, None] + phases) // repeats
-        weight = np.exp(self._score - self._score.max()) / repeats
+        weight = np.exp(self._score - self._score.max())
         return float(weight[(bursts == bursts[:1]).all(axis=0)].sum() / weight.sum())
 
     def update(self, first_copy: int, llr: FloatArray) -> None:
