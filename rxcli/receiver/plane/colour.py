@@ -19,7 +19,7 @@ from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
 _N_CELLS, _CELL_PX, _BLOCK_ROWS = 48, 12, 96
 #: Light of dark slots over that of lit ones up to which red blinks, or hardly counts.
 _PLAIN_DARK = 0.02
-#: Red blinks or not, with a contrast of 1 or 0; standard errors from the middle that decide it.
+#: Red blinks or not, with a contrast of 1 or 0, whichever is nearer; standard errors at which the other is excluded.
 _MIDDLE, _SURE = 0.5, 3.0
 #: Values of a colour, of the largest one, that are too dark to compare, and from which they may be clipped.
 _DARK, _CLIPPED = 0.01, 0.98
@@ -88,7 +88,7 @@ def red_contrast(frame: Frame) -> tuple[float, float] | None:
         return None
     contrast = float(shared.sum()) / total
     error = float(np.sqrt(np.square(shared - contrast * own).sum())) / total
-    return (contrast, error) if abs(contrast - _MIDDLE) > _SURE * error else None
+    return (contrast, error) if _MIDDLE + abs(contrast - _MIDDLE) > _SURE * error else None
 
 
 def _thinned(frame: Frame, mosaic: Mosaic) -> Float32Array:
