@@ -29,6 +29,7 @@ from rxcli.cli.kinds import FILE, FOLDER, SHARE
     ("--dump-dir", FOLDER, None, "Write the arrays of every stage boundary into this folder."),
     ("--save-undistorted", FOLDER, None, "Write every frame without its lens distortion into this folder."),
     ("--save-camera", FILE, None, "Write what was estimated of an unknown camera as a profile (TOML)."),
+    ("--same-camera", None, False, "All photos are by one camera: what one of them shows of it serves for all."),
     ("--stop-when-certain", None, False, "Pass over frames of a clip all of whose packets are certain already."),
     ("--out", FOLDER, None, "Write files that came whole into this folder, under their own names."),
     ("--packets", None, False, "Show every packet of a clip, not only its sum."),

@@ -20,7 +20,8 @@ from rxcli.errors import ExitCode, InputError, ReceiverError, worst
 from rxcli.ingest import KNOWN_SUFFIXES, MAX_BYTES, open_source
 from rxcli.link.collector import PhotoCollector
 from rxcli.link.saving import save_objects
-from rxcli.profiles import dump_profile
+from rxcli.options import ReceiverOptions
+from rxcli.profiles import CameraProfile, dump_profile
 from rxcli.results import report, summary
 from rxcli.results.baseline import load_baseline
 from rxcli.results.truth import Scorer, load_truth, truth_for
@@ -58,7 +59,35 @@ def run(paths: tuple[str, ...], given: dict[str, Any]) -> ExitCode:
         after = tap.finish
     taken = _claim(given, sources)
     with _stdin_as_file(sources) as sources:
+        if given["same_camera"]:
+            configured = _with_same_camera(sources, configured)
         return _Run(batch.standard_decoder(configured, tap, after), given, taken, sources).run()
+
+
+def _with_same_camera(sources: list[batch.Source], configured: ReceiverOptions) -> ReceiverOptions:
+    """The options with the camera that the first photo with packets in half of its columns gives an estimate of."""
+    decoder = batch.standard_decoder(replace(configured, soft_bits=False, dump_dir=None))
+    for source, results in batch.decode_here(sources, decoder):
+        photo = next(iter(results))
+        n_received = sum(any(packet.is_believable for packet in column.packets) for column in photo.columns)
+        if "line_delay_s" in photo.estimated and 2 * n_received >= max(len(photo.columns), 1):
+            profile = _estimated_camera(photo, source.path, "same-camera")
+            log.info("all photos are taken as by the camera of %s", source.name)
+            if profile.models:
+                return replace(configured, cameras=(profile, *configured.cameras))
+            return replace(configured, cameras=(profile,), force_camera=True)
+    log.warning("--same-camera: no photo gives packets in half of its columns; each camera is estimated by itself")
+    return configured
+
+
+def _estimated_camera(result: FrameResult, path: str, name: str) -> CameraProfile:
+    """A profile of the camera that was estimated from a frame of the file at `path`."""
+    from rxcli.receiver.camera import camera_profile
+    from rxcli.receiver.plane.orientation import as_received
+
+    frame, _ = as_received(next(iter(open_source(path))), result)
+    about = frame.metadata
+    return camera_profile(result.estimated, name, about.make, about.model, frame.width, frame.height)
 
 
 def _check(paths: tuple[str, ...], given: dict[str, Any], n_sources: int) -> None:
@@ -275,16 +304,11 @@ class _Run:
             self._estimated = result
 
     def _save_camera(self, path: Path) -> None:
-        from rxcli.receiver.camera import camera_profile
-        from rxcli.receiver.plane.orientation import as_received
-
         if self._estimated is None:
             log.error("%s was not written: no packet was received with an estimated camera", path)
             return
-        frame, _ = as_received(next(iter(open_source(self._paths[self._estimated.source]))), self._estimated)
-        about = frame.metadata
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).lstrip("._-") or "camera"
-        profile = camera_profile(self._estimated.estimated, name, about.make, about.model, frame.width, frame.height)
+        profile = _estimated_camera(self._estimated, self._paths[self._estimated.source], name)
         outputs.write_whole(path, dump_profile(profile))
 
     def _conclude(self) -> list[ExitCode]:

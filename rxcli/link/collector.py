@@ -10,7 +10,7 @@ from rxcli.link.files import FilesUnderWay
 from rxcli.link.placement import Placement, placed
 from rxcli.link.receiver import LinkReceiver
 from rxcli.link.softbits import Event
-from rxcli.profiles import ScreenProfile
+from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.types import FILE_MEMORY_MB, FrameResult, FrameSoftBits, Message, ObjectProgress, ReceivedObject
 
 
@@ -72,6 +72,8 @@ class PhotoCollector(Collector):
 
     #: Number of photos that were incomplete on their own.
     n_photos = 0
+    #: Their camera, where it is known that they are all by one.
+    camera: CameraProfile | None = None
     _waiting: FrameResult | None = None
 
     def add(self, result: FrameResult) -> FrameResult:

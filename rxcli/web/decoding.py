@@ -24,6 +24,8 @@ from PIL import Image
 from rxcli.errors import InputError, capitalised, sentence, without_commands
 from rxcli.link.collector import PhotoCollector
 from rxcli.options import ReceiverOptions
+from rxcli.profiles import CameraProfile
+from rxcli.receiver.camera import camera_profile
 from rxcli.resources import data_dir
 from rxcli.results import report
 from rxcli.results.aim import split_message
@@ -237,10 +239,14 @@ def answer_for(
     except InputError as error:
         return refusal(error.message, error.hint)
     gathered, wait_s, published_s = _Gathered(options, time.process_time() + _CLIP_S), _PARTIAL_S, started_s
+    if photos and photos.camera:  # the photos of one visitor are by one camera
+        options = replace(options, cameras=(photos.camera, *options.cameras))
     decoder = standard_decoder(options, gathered.tap)
     try:
         for result in decoder.results(Source(name, str(path))):
             gathered.add(_without(photos.add(result) if photos else result, path))
+            if photos and gathered.frame is not None and result.frame == 0:
+                photos.camera = photos.camera or _estimated_camera(result, gathered.frame)
             if publish is not None and gathered.has_news and time.monotonic() - published_s > wait_s:
                 publish(gathered.answer() | {"name": name, "partial": True})
                 wait_s, published_s = 2 * wait_s, time.monotonic()
@@ -249,6 +255,16 @@ def answer_for(
         return refusal("it takes too much memory", "try a smaller picture")
     together = _files(photos.progress) if photos else None
     return answer | {"name": name, "seconds": round(time.monotonic() - started_s, 2), "together": together}
+
+
+def _estimated_camera(result: FrameResult, frame: Frame) -> CameraProfile | None:
+    """The camera as estimated from a photo that gave packets in half of its columns, None otherwise."""
+    n_received, about = sum(any(p.is_believable for p in c.packets) for c in result.columns), frame.metadata
+    if result.quarter_turns or not about.model or 2 * n_received < max(len(result.columns), 1):
+        return None
+    if "line_delay_s" not in result.estimated:
+        return None
+    return camera_profile(result.estimated, "visitor", about.make, about.model, frame.width, frame.height)
 
 
 def _files(progress: Iterable[ObjectProgress]) -> list[dict[str, Any]]:
