@@ -124,7 +124,10 @@ def test_corners_are_those_of_each_frame(shaky: Clip) -> None:
     sent = np.array(shaky_corners(), np.float64)
     found = np.array([result.corners for result in results])
     assert np.abs(np.diff(sent, axis=0)).max() > 3
-    assert np.sqrt(np.square(found - sent).mean()) < 4
+    off = found - sent
+    # The first frames' outline is off by some pixels; the motion since then is followed to a fraction of one.
+    assert np.sqrt(np.square(off).mean()) < 4.5
+    assert np.sqrt(np.square(off - off.mean(axis=0)).mean()) < 0.3
 
 
 def test_a_screen_at_rest_is_looked_for_now_and_then_until_it_moves(monkeypatch: pytest.MonkeyPatch) -> None:
