@@ -160,8 +160,10 @@ def _clocks(
         first, last = (int(rows * length) for rows in (shortest, longest))
         lags = first + _peaks(copies[first : last + 1], SETTINGS.n_peaks, max(round(2 * shortest), 1))
         for rows in np.concatenate([lines, lags / length]).tolist():
-            if length > min(exposures) and rows * (length - PREAMBLE_SLOTS) > n_rows:
-                continue  # Only of the shortest packets may a picture show less than a payload.
+            # Of the shortest packets a picture may show less than a payload, but more than a preamble.
+            least = length - PREAMBLE_SLOTS if length > min(exposures) else min(length, 2 * PREAMBLE_SLOTS)
+            if rows * least > n_rows:
+                continue
             common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
             common += 2 * min(
                 float(np.interp(harmonics * n_rows / rows, np.arange(line.size), line).max()), SETTINGS.max_line
