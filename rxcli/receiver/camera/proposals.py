@@ -161,7 +161,8 @@ def _clocks(
         lags = first + _peaks(copies[first : last + 1], SETTINGS.n_peaks, max(round(2 * shortest), 1))
         for rows in np.concatenate([lines, lags / length]).tolist():
             # Of the shortest packets a picture may show less than a payload, but more than a preamble.
-            least = length - PREAMBLE_SLOTS if length > min(exposures) else min(length, 2 * PREAMBLE_SLOTS)
+            least = length - PREAMBLE_SLOTS
+            least = least if length > min(exposures) else min(least, 2 * PREAMBLE_SLOTS)
             if rows * least > n_rows:
                 continue
             common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
