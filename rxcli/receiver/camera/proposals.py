@@ -221,7 +221,7 @@ def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_be
 def _long_exposures(strips: ColumnStrips, *, is_stated: bool) -> Iterator[tuple[float, float, float]]:
     """Rows a slot, strength of their line, and exposure in slots; none if the strongest is of a short exposure."""
     lines = slot_lines(strips)
-    lines = [line for line in lines if line[1] >= SETTINGS.min_line_share * lines[0][1]]
+    lines = [line for line in lines if line[1] >= max(SETTINGS.min_line_share * lines[0][1], SETTINGS.min_line)]
     # Of light that is exposed for half a slot more than whole ones the line is at twice the rate.
     lines += [(2 * rows, strength) for rows, strength in lines if not _is_among(2 * rows, lines)]
     for number, (rows, strength) in enumerate(lines):

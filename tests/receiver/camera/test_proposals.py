@@ -121,7 +121,7 @@ def test_an_exposure_that_no_file_states_is_proposed_by_the_width_of_the_stripes
 
 @pytest.mark.parametrize("exposure_slots", [3.5, 4.0, 6.2])
 def test_an_exposure_of_several_slots_shows_in_the_changes_of_the_light(exposure_slots: float) -> None:
-    frame, corners, _ = phone("paper-8k65", 8.0, 1200, exposure_slots=exposure_slots)
+    frame, corners, _ = phone("paper-8k65", 8.0, 1600, exposure_slots=exposure_slots)
     best = blind.propose(strips_of(frame, corners), SCREENS)[0]
     assert best.rows_per_slot == pytest.approx(8.0, rel=3e-3)
     assert best.exposure_slots == pytest.approx(exposure_slots, abs=0.25)
