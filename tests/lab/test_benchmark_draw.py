@@ -146,7 +146,7 @@ def test_binning_keeps_the_electrons() -> None:
     assert draw.binned(whole, 1.5) is whole
 
 
-@pytest.mark.parametrize("name", ["speed/video-4k", "speed/video-1080p", "memory/clip of 1000"])
+@pytest.mark.parametrize("name", ["speed/4K, 24 frames", "speed/1080p, 300 frames", "memory/clip of 1000"])
 def test_the_payload_comes_again_with_the_first_frame_of_a_clip(name: str) -> None:
     scenario, _, point = name.partition("/")
     medium = Medium(**scenarios()[scenario].points[point])

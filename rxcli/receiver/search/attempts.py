@@ -69,7 +69,8 @@ def _receive_stated(cache: FrameCache, options: ReceiverOptions, receive: _Recei
         if not _gives_few(best.result) or is_plain or (attempt is not cache and not received.result.search):
             break
         received = receive(attempt, estimating)
-        if received.n_believable > best.n_believable and _is_credible(received.result, cache.frame, options):
+        # One packet is no evidence that what was stated is wrong.
+        if received.n_believable > max(best.n_believable, 1) and _is_credible(received.result, cache.frame, options):
             message = _difference(cache.frame, options, stated, received, is_exposure=attempt is not cache)
             best = received.with_remark(message)
     return best

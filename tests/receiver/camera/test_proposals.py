@@ -127,6 +127,16 @@ def test_an_exposure_of_several_slots_shows_in_the_changes_of_the_light(exposure
     assert best.exposure_slots == pytest.approx(exposure_slots, abs=0.25)
 
 
+@pytest.mark.parametrize("n_rows", [30, 90, 200])
+def test_less_than_a_header_in_view_is_no_error(n_rows: int) -> None:
+    frame, corners, _ = phone("paper-17k3", 16.0, 400, exposure_slots=0.5)
+    whole = strips_of(frame, corners)
+    light, inside, x = (part[:, :n_rows] for part in (whole.light, whole.inside, whole.x))
+    few = replace(whole, light=light, inside=inside, x=x, rows=whole.rows[:n_rows])
+    for exposure_s in (None, 3e-5, 3e-4):
+        assert all(np.isfinite(found.score) for found in blind.propose(few, SCREENS, exposure_s))
+
+
 def _bend_error_slots(
     estimated: dict[str, tuple[float, float]], corners: FloatArray, truth: dict[str, Any], upside_down: bool
 ) -> float:
