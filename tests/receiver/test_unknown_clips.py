@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rxcli.options import ReceiverOptions
+from rxcli.receiver.clip.ledger import Ledger
+from rxcli.receiver.clip.views import Waiting
 from rxcli.receiver.receive import receive
 from rxcli.receiver.search import cameras
-from rxcli.types import Metadata
+from rxcli.types import FrameResult, Metadata
 from tests.receiver.test_video import Clip, scored, simulate
 
 N_FRAMES = 5
@@ -70,3 +74,25 @@ def test_frames_of_half_a_packet_show_together_which_screen_it_is(named: bool) -
     assert all(result.screen_profile in ("data-17k3", "paper-17k3") for result in results)
     assert not any(packet.is_believable for result in results for packet in result.packets)
     assert results[-1].line_delay_s == pytest.approx(_line_delay_s(clip), rel=1e-3)
+
+
+def test_a_scene_learns_from_its_own_frames_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames wait for the phase of their bursts; by then another scene, with other strips, may be tracked."""
+    learned: list[str] = []
+
+    class Scene:
+        def can_measure_again(self, view: Any) -> bool:
+            return bool(view.flat == "own")
+
+        def update(self, view: Any, lit: object) -> None:
+            learned.append(view.flat)
+
+    ledger = Ledger(ReceiverOptions(), None)
+    monkeypatch.setattr(ledger, "_scene", Scene())
+    monkeypatch.setattr(ledger, "_add_bursts", lambda view: None)
+    for flat in ("before", "own"):
+        view: Any = SimpleNamespace(numbers=None, flat=flat)
+        ledger._waiting.append(Waiting(FrameResult("clip", 0, 0.0, "ok"), view))
+    timeline: Any = SimpleNamespace(number=lambda view: setattr(view, "numbers", np.zeros(0, int)))
+    ledger._number_frames(timeline)
+    assert learned == ["own"]

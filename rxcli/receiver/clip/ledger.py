@@ -153,8 +153,9 @@ class Ledger:
             if view.numbers is None:
                 timeline.number(view)
                 self._add_bursts(view)
-                if self._scene is not None and view.flat is not None:
-                    self._scene.update(view, partial(lit_slots, view, self._open(view)))
+                scene = self._scene  # The frames of the one before may still wait.
+                if scene is not None and view.flat is not None and scene.can_measure_again(view):
+                    scene.update(view, partial(lit_slots, view, self._open(view)))
 
     def _add_bursts(self, view: View) -> None:
         for burst in bursts_of(view):
