@@ -296,9 +296,10 @@ def _first_decision(columns: ColumnLight, rows: FloatArray, clock: Clock, isi_me
     response = known_picture.Response()
     expected = known_picture.expected_light(half, positions, clock.exposure_slots, isi_memory, response)
     metrics = known_picture.slot_likelihoods(columns, expected, clock, isi_memory).metrics
-    bursts = by_burst(metrics, replace(clock, burst=np.arange(clock.n_copies)))
+    single = replace(clock, burst=np.arange(clock.n_copies))
+    bursts = by_burst(metrics, single)
     posteriors = detect.detect(bursts, detect.plausible_weights(bursts, 0.0))
-    return clock.on_grid(posteriors.lit)
+    return single.on_grid(posteriors.lit)
 
 
 def _measured(
