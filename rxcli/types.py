@@ -241,6 +241,11 @@ class Clock:
         return int(self.burst.size)
 
     @property
+    def by_copy(self) -> Clock:
+        """The same with every copy a burst of its own."""
+        return replace(self, burst=np.arange(self.n_copies))
+
+    @property
     def places(self) -> IntArray:
         """(N,) position of every grid slot in its packet."""
         return np.asarray((np.arange(self.n_slots) + self.first_slot) % self.packet_slots)
@@ -553,6 +558,12 @@ class FrameResult:
     def packets(self) -> tuple[PacketResult, ...]:
         """Packets of all columns."""
         return tuple(packet for column in self.columns for packet in column.packets)
+
+    @property
+    def gives_camera(self) -> bool:
+        """Whether the camera was estimated and half of the columns gave packets, so that it holds for other photos."""
+        n_received = sum(any(packet.is_believable for packet in column.packets) for column in self.columns)
+        return "line_delay_s" in self.estimated and 2 * n_received >= max(len(self.columns), 1)
 
     @property
     def numbering_remark(self) -> str:

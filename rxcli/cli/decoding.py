@@ -69,8 +69,7 @@ def _with_same_camera(sources: list[batch.Source], configured: ReceiverOptions) 
     decoder = batch.standard_decoder(replace(configured, soft_bits=False, dump_dir=None))
     for source, results in batch.decode_here(sources, decoder):
         photo = next(iter(results))
-        n_received = sum(any(packet.is_believable for packet in column.packets) for column in photo.columns)
-        if "line_delay_s" in photo.estimated and 2 * n_received >= max(len(photo.columns), 1):
+        if photo.gives_camera:
             profile = _estimated_camera(photo, source.path, "same-camera")
             log.info("all photos are taken as by the camera of %s", source.name)
             if profile.models:

@@ -27,6 +27,9 @@ _FINE = 32
 _MEMORY_SLOTS = 1.3
 #: Longest ISI memory of the trellis; seven slots cover an exposure of seven.
 _MAX_MEMORY = 7
+#: Exposure from which no sample shows a slot by itself, so that changes of the light over a slot are looked at; and
+#: one from which a packet's last slots reach beyond the header of the next, slots.
+LONG_EXPOSURE_SLOTS, MAX_EXPOSURE_SLOTS = 2.3, 9.5
 #: The dark slots in the middle of a header.
 _DARK_FROM = HEADER.index(0, HEADER.index(1))
 _DARK_TO = HEADER.index(1, _DARK_FROM)

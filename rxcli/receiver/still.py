@@ -22,9 +22,16 @@ from rxcli.receiver.decode.settings import SURVIVORS as survivor_settings
 from rxcli.receiver.frame.acquisition import Acquisition, noise_of
 from rxcli.receiver.frame.passes import Reception, dark_columns, packet_llr
 from rxcli.receiver.frame.settings import SETTINGS, STILL
-from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma, slot_llr
+from rxcli.receiver.light import (
+    LONG_EXPOSURE_SLOTS,
+    MAX_EXPOSURE_SLOTS,
+    Crosstalk,
+    Exposure,
+    NoiseModel,
+    dark_sigma,
+    slot_llr,
+)
 from rxcli.receiver.sync import clock as sync
-from rxcli.receiver.sync.settings import SETTINGS as SYNC
 from rxcli.types import (
     BurstPosteriors,
     BurstSamples,
@@ -77,7 +84,7 @@ def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception, *
     skipped = {"certain_columns": n_columns - candidates.size, "dark_columns": candidates.size - lit.size}
     # Joint detection gives no metrics, and developing mixes rows that are few per slot.
     by_slot = adds_up or initial.clock.rows_per_slot < STILL.min_joint_rows
-    if lit.size and by_slot and initial.free_log_evidence is None:
+    if lit.size and by_slot and not initial.is_long:
         reception, _ = without_row_noise(acquisition, reception, lit)
         if (doubtful := np.intersect1d(lit, doubtful_columns(reception))).size:
             reception, _ = without_row_noise(acquisition, reception, doubtful)
@@ -88,7 +95,7 @@ def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception, *
 
 def _with_tails(acquisition: Acquisition, initial: Reception) -> Reception:
     """The initial pass with crosstalk as decided slots show it, where that is wider than in the screen's profile."""
-    if initial.free_log_evidence is not None:
+    if initial.is_long:
         return initial
     lit, columns = initial.clock.on_grid(initial.posteriors.lit), np.arange(len(initial.snr))
     trust, light_spread = initial.best_confidence(), acquisition.screen.light_spread
@@ -104,7 +111,7 @@ def initial_pass(acquisition: Acquisition) -> Reception:
     """Make a pass over strips binned in pairs, from an initial estimate of the slots."""
     acquisition = replace(acquisition, profiles=acquisition.binned)
     clock = acquisition.clock
-    if clock.exposure_slots > SYNC.long_exposure_slots:
+    if clock.exposure_slots > LONG_EXPOSURE_SLOTS:
         return _joint_initial_pass(acquisition)
     # Demosaicing and denoising mix neighbouring rows: with few rows per slot this widens the effective exposure.
     exposure_slots = float(np.hypot(clock.exposure_slots, 1 / clock.rows_per_slot))
@@ -144,7 +151,7 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
         noise, crosstalk = model.noise, model.crosstalk
         return ratios.burst_samples(by_start, clock, model.black_level, noise, crosstalk, columns, lit)
 
-    single = replace(clock, burst=np.arange(clock.n_copies))
+    single = clock.by_copy
     alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
     lit = single.on_grid(alone.lit)
     metrics = channel.metrics_of(llr_of(lit), 1)
@@ -185,19 +192,18 @@ def llr_of(lit: Float32Array) -> Float32Array:
 def follow_picture(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
     """Detect slots and picture of some columns jointly, with all strips, given the slots decided so far."""
     clock, q = reception.clock, STILL.coarse_samples
-    is_long = reception.free_log_evidence is not None
-    if is_long:
+    if reception.is_long:
         reception = _refined(acquisition, reception, columns)
         clock = reception.clock
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), q, ratios.by_start(clock))
     lit = clock.on_grid(reception.posteriors.lit)
     bursts = ratios.burst_samples(samples, clock, model.black_level, model.noise, model.crosstalk, columns, lit)
-    if not is_long:
+    if not reception.is_long:
         prior = np.maximum(reception.posteriors.w_log_prob[columns], STILL.min_weight_log_prior) / bursts.n_bursts
         bursts = replace(bursts, w_log_prior=np.tile(prior, (bursts.n_bursts, 1)))
     found = survivors.detect(bursts)
     header_llr, log_prob = reception.posteriors.header_llr[:, columns], found.log_prob
-    if is_long:  # Where arbitrary slots explain a column as well, it may have no packets.
+    if reception.is_long:  # Where arbitrary slots explain a column as well, it may have no packets.
         log_prob = log_prob - np.logaddexp(0, -header_llr.sum(axis=0))[None, :, None] / log_prob.shape[2]
     log_evidence = reception.posteriors.log_evidence[columns]
     found = replace(found, header_llr=header_llr, log_evidence=log_evidence, log_prob=log_prob)
@@ -249,7 +255,7 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
 
 def _exposed_for(clock: Clock, factor: float) -> Clock:
     """The clock with another exposure that ends at the same time."""
-    longer = min((factor - 1) * clock.exposure_slots, SYNC.max_exposure_slots - clock.exposure_slots)
+    longer = min((factor - 1) * clock.exposure_slots, MAX_EXPOSURE_SLOTS - clock.exposure_slots)
     row0 = clock.row0 + longer / 2 * clock.rows_per_slot
     return replace(clock, exposure_slots=clock.exposure_slots + longer, row0=row0)
 
@@ -259,7 +265,7 @@ def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[
 
     Each comes with the log-odds by which its copies are less likely so by themselves.
     """
-    if reception.free_log_evidence is not None:
+    if reception.is_long:
         return
     (_, log_weight), *rivals = sync.possible_bursts(reception.clock, slot_llr(reception.metrics), acquisition.repeats)
     for clock, rival_log_weight in rivals:
@@ -339,7 +345,7 @@ def apply_autoencoder(
     n_columns = len(reception.snr)
     columns = np.arange(n_columns) if options.cae == "always" else doubtful_columns(reception)
     columns = _worth_showing(acquisition, reception, columns)
-    if options.cae == "never" or columns.size == 0 or reception.free_log_evidence is not None:
+    if options.cae == "never" or columns.size == 0 or reception.is_long:
         return reception, frozenset(), None
     report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
     by_slot, scene = without_row_noise(acquisition, reception, columns)

@@ -258,11 +258,9 @@ def answer_for(
 
 
 def _estimated_camera(result: FrameResult, frame: Frame) -> CameraProfile | None:
-    """The camera as estimated from a photo that gave packets in half of its columns, None otherwise."""
-    n_received, about = sum(any(p.is_believable for p in c.packets) for c in result.columns), frame.metadata
-    if result.quarter_turns or not about.model or 2 * n_received < max(len(result.columns), 1):
-        return None
-    if "line_delay_s" not in result.estimated:
+    """The camera as estimated from a photo that names its model and was not turned, None otherwise."""
+    about = frame.metadata
+    if result.quarter_turns or not about.model or not result.gives_camera:
         return None
     return camera_profile(result.estimated, "visitor", about.make, about.model, frame.width, frame.height)
 

@@ -118,7 +118,7 @@ def _simulated(simulated: SimulatedScene, seed: int) -> Sample | None:
         return None
     reception = decode(found.best.acquisition, trial.options().skip, found.best.reception)
     columns = doubtful_columns(reception)
-    if reception.free_log_evidence is not None or not columns.size:
+    if reception.is_long or not columns.size:
         return None
     _, scene = without_row_noise(found.best.acquisition, reception, columns)
     slots = sent_slots(trial.capture.exposure, scene.clock)

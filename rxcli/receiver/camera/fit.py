@@ -15,7 +15,7 @@ from rxcli.receiver.camera.curvature import curvature_terms
 from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import ColumnStrips, joined
-from rxcli.receiver.light import SlotLight, column_light
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, SlotLight, column_light
 from rxcli.types import Clock, Float32Array, FloatArray
 
 #: Rows over which the bend is straight: of a block of the normal equations.
@@ -56,7 +56,7 @@ def settle(
     least = hypothesis.stated_exposure_slots
     exposure, exposure_sd = max(clock.exposure_slots, least), 0.0
     # A longer one is known better by the changes of the light.
-    if exposure <= SETTINGS.long_exposure_slots:
+    if exposure <= LONG_EXPOSURE_SLOTS:
         exposure, exposure_sd = model.exposure(start, exposure)
         exposure = max(exposure, least)
     values, covariance, near = model.fit(start, exposure, start.size if may_bend else 2)

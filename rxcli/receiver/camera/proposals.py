@@ -20,6 +20,7 @@ from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.curvature import likeliest_bend, straightened
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import ColumnStrips, columns_of, joined, levelled
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MAX_EXPOSURE_SLOTS
 from rxcli.types import Float32Array, FloatArray
 
 #: Samples a slot at which headers are sought; bins of the spectrum to a line's width.
@@ -74,10 +75,10 @@ def propose(
     level *= weight
     bends = [np.zeros(4)] + ([likeliest_bend(coarse, level)] if may_bend else [])
     found = [clock for bend in bends for clock in _clocks(coarse, level, bend, width, exposures)]
-    is_short = exposure_s is not None and max(exposures.values()) <= SETTINGS.long_exposure_slots
+    is_short = exposure_s is not None and max(exposures.values()) <= LONG_EXPOSURE_SLOTS
     smeared = [] if is_short else _distinct(_smeared_clocks(strips, exposures, may_bend=may_bend))
     if smeared:  # Stripes as wide as those of the longest exposures are of no short one.
-        found = [clock for clock in found if clock.exposure_slots < SETTINGS.long_exposure_slots]
+        found = [clock for clock in found if clock.exposure_slots < LONG_EXPOSURE_SLOTS]
     short = _distinct(clock for clock in found if not any(_is_same(clock, better) for better in smeared))
     ranked = sorted(smeared + short, key=lambda clock: -clock.score)
     return [replace(clock, number=number) for number, clock in enumerate(ranked)]
@@ -155,7 +156,6 @@ def _clocks(
     harmonics = _FINE * np.array([1, 2])
     copies = _surprise(correlation, round(2 * SLOTS_PER_SYMBOL * shortest))
     total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
-    limit = SETTINGS.long_exposure_slots
     for length, exposure in exposures.items():
         first, last = (int(rows * length) for rows in (shortest, longest))
         lags = first + _peaks(copies[first : last + 1], SETTINGS.n_peaks, max(round(2 * shortest), 1))
@@ -165,23 +165,10 @@ def _clocks(
             least = least if length > min(exposures) else min(least, 2 * PREAMBLE_SLOTS)
             if rows * least > n_rows:
                 continue
-            common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
-            common += 2 * min(
-                float(np.interp(harmonics * n_rows / rows, np.arange(line.size), line).max()), SETTINGS.max_line
-            )
-            for is_reversed, header in enumerate(_header_peaks(total, rows, length)):
-                yield CameraHypothesis(
-                    rows_per_slot=rows * pitch,
-                    packet_slots=length,
-                    reversed=bool(is_reversed),
-                    curvature=bend,
-                    exposure_slots=exposure or min(exposure_of(half_width / rows, rows * pitch), limit),
-                    score=max(header, 0.0) ** 2 + common,
-                    # A period that is off by a quarter of a slot over the picture shows as well.
-                    rows_per_slot_sd=rows * rows * pitch / (4 * n_rows),
-                    curvature_sd=np.abs(bend) / 4,
-                    stated_exposure_slots=exposure,
-                )
+            strength = float(np.interp(harmonics * n_rows / rows, np.arange(line.size), line).max())
+            found = min(exposure_of(half_width / rows, rows * pitch), LONG_EXPOSURE_SLOTS)
+            clock = _Clock(rows, length, strength, exposure, found)
+            yield from _both_ways(clock, copies, total, bend, pitch)
 
 
 def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_bend: bool) -> Iterator[CameraHypothesis]:
@@ -192,42 +179,75 @@ def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_be
         exposures: stated exposure in slots by packet length, 0 for none.
         may_bend: whether the camera may have taken a distortion out.
     """
-    for rows, strength, exposure_slots in _long_exposures(strips, is_stated=any(exposures.values())):
-        change = changes_over(strips, rows)
+    for rows, strength, found, change in _long_exposures(strips, is_stated=any(exposures.values())):
         bends = [np.zeros(4)] + ([likeliest_bend(strips, change)] if may_bend else [])
         for bend in bends:
             columns = columns_of(straightened(strips, change, bend), strips.n_columns)
             copies = _surprise(_autocorrelation(columns), round(2 * SLOTS_PER_SYMBOL * rows))
             total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
             for length, exposure in exposures.items():
-                if rows * (length - PREAMBLE_SLOTS) > columns.shape[1]:
-                    continue
-                common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
-                common += 2 * min(strength, SETTINGS.max_line)
-                for is_reversed, header in enumerate(_header_peaks(total, rows, length)):
-                    yield CameraHypothesis(
-                        rows_per_slot=rows * strips.pitch,
-                        packet_slots=length,
-                        reversed=bool(is_reversed),
-                        curvature=bend,
-                        exposure_slots=exposure or exposure_slots,
-                        score=max(header, 0.0) ** 2 + common,
-                        rows_per_slot_sd=rows * rows * strips.pitch / (4 * columns.shape[1]),
-                        curvature_sd=np.abs(bend) / 4,
-                        stated_exposure_slots=exposure,
-                    )
+                if rows * (length - PREAMBLE_SLOTS) <= columns.shape[1]:
+                    clock = _Clock(rows, length, strength, exposure, found)
+                    yield from _both_ways(clock, copies, total, bend, strips.pitch)
 
 
-def _long_exposures(strips: ColumnStrips, *, is_stated: bool) -> Iterator[tuple[float, float, float]]:
-    """Rows a slot, strength of their line, and exposure in slots; none if the strongest is of a short exposure."""
+@dataclass(frozen=True, slots=True)
+class _Clock:
+    """Rows a slot and length of packets that may be those of a picture."""
+
+    rows: float
+    length: int
+    #: How far the line of the slots stands out, log-likelihood.
+    strength: float
+    #: Exposure that the file states, 0 where it does not, and that the light shows, slots.
+    stated: float
+    found: float
+
+
+def _both_ways(
+    clock: _Clock, copies: FloatArray, total: FloatArray, bend: FloatArray, pitch: float
+) -> Iterator[CameraHypothesis]:
+    """Cameras with a clock, as the rows stand and read backwards.
+
+    Args:
+        clock: the clock.
+        copies: (R,) excess of the columns' autocorrelation.
+        total: (R + 1,) running sum of the columns' mean.
+        bend: (4,) of the stripes.
+        pitch: picture rows of a row.
+    """
+    rows, length = clock.rows, clock.length
+    common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
+    common += 2 * min(clock.strength, SETTINGS.max_line)
+    for is_reversed, header in enumerate(_header_peaks(total, rows, length)):
+        yield CameraHypothesis(
+            rows_per_slot=rows * pitch,
+            packet_slots=length,
+            reversed=bool(is_reversed),
+            curvature=bend,
+            exposure_slots=clock.stated or clock.found,
+            score=max(header, 0.0) ** 2 + common,
+            # A period that is off by a quarter of a slot over the picture shows as well.
+            rows_per_slot_sd=rows * rows * pitch / (4 * copies.size),
+            curvature_sd=np.abs(bend) / 4,
+            stated_exposure_slots=clock.stated,
+        )
+
+
+def _long_exposures(strips: ColumnStrips, *, is_stated: bool) -> Iterator[tuple[float, float, float, Float32Array]]:
+    """Rows a slot, strength of their line, exposure in slots and the changes of the light over a slot.
+
+    None if the strongest line is of a short exposure.
+    """
     lines = slot_lines(strips)
     lines = [line for line in lines if line[1] >= max(SETTINGS.min_line_share * lines[0][1], SETTINGS.min_line)]
     # Of light that is exposed for half a slot more than whole ones the line is at twice the rate.
     lines += [(2 * rows, strength) for rows, strength in lines if not _is_among(2 * rows, lines)]
     for number, (rows, strength) in enumerate(lines):
-        exposure = exposure_by_changes(columns_of(changes_over(strips, rows), strips.n_columns), rows)
-        if exposure > SETTINGS.long_exposure_slots or is_stated:
-            yield rows, strength, exposure
+        change = changes_over(strips, rows)
+        exposure = exposure_by_changes(columns_of(change, strips.n_columns), rows)
+        if exposure > LONG_EXPOSURE_SLOTS or is_stated:
+            yield rows, strength, exposure, change
         elif number == 0:
             return
 
@@ -262,8 +282,8 @@ def _likeness_of_changes() -> tuple[FloatArray, FloatArray, FloatArray]:
     apart = np.abs(np.arange(-reach, reach + 1))
     alike = np.where(apart == 0, 1.0, -np.maximum(1 - apart / SLOTS_PER_SYMBOL, 0) / (SLOTS_PER_SYMBOL - 1))
     slots = np.convolve(np.interp(every, np.arange(-reach, reach + 1), alike), _TRIANGLE, "same")
-    exposures = np.arange(SETTINGS.min_exposure_slots, SETTINGS.longest_exposure_slots, SETTINGS.exposure_step)
-    lags = np.arange(0, SETTINGS.longest_exposure_slots + 1.5, step)
+    exposures = np.arange(SETTINGS.min_exposure_slots, MAX_EXPOSURE_SLOTS, SETTINGS.exposure_step)
+    lags = np.arange(0, MAX_EXPOSURE_SLOTS + 1.5, step)
     shapes = [
         2 * np.interp(lags, every, slots) - np.interp(lags - e, every, slots) - np.interp(lags + e, every, slots)
         for e in exposures.tolist()

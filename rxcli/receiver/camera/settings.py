@@ -44,10 +44,7 @@ class EstimateSettings:
     same_clock: float = 4e-3
     n_proposed: int = 5
 
-    #: Exposure from which changes of the light are looked at; the longest one, and the step between those compared,
-    #: slots.
-    long_exposure_slots: float = 2.3
-    longest_exposure_slots: float = 9.5
+    #: Step between the exposures that are compared, slots.
     exposure_step: float = 0.1
     #: Least strength of a line that is looked at, as a share of the strongest.
     min_line_share: float = 0.5

@@ -240,8 +240,8 @@ def _receive_anew(
         reception = decode(acquisition, options.skip, acquired.initial, adds_up=True)
     with timer("denoise"):
         reception, denoised, report = apply_autoencoder(acquisition, reception, options)
-    is_long = reception.free_log_evidence is not None  # Arbitrary slots were compared with packets already.
-    if ledger.start is None and not is_long and shows_steady_light(reception):
+    # Of long exposures packets were compared with arbitrary slots already.
+    if ledger.start is None and not reception.is_long and shows_steady_light(reception):
         return Lost(known), Failure("no_signal", STEADY_LIGHT), None
     if assemble.all_dark(reception.snr):
         return Lost(known), Failure("no_signal", _NOTHING_LIT), None
@@ -276,10 +276,9 @@ def _can_track(acquired: Acquired, options: ReceiverOptions) -> bool:
 
 
 def _bursts_of(frame: Frame, reception: Reception) -> tracking.FrameBursts:
-    by_copy = replace(reception.clock, burst=np.arange(reception.clock.n_copies))
-    shown = np.minimum(assemble.slots_observed(reception.samples, by_copy), 1)
+    shown = np.minimum(assemble.slots_observed(reception.samples, reception.clock.by_copy), 1)
     metrics = reception.metrics
-    if reception.free_log_evidence is not None:
+    if reception.is_long:
         lit = reception.clock.on_grid(reception.posteriors.lit)
         metrics = channel.metrics_of(llr_of(lit), reception.model.exposure.isi_memory)
     return tracking.FrameBursts(frame.index, 0, reception.clock, metrics, shown)

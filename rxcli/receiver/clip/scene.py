@@ -11,20 +11,19 @@ import numpy as np
 from rxcli.numerics import TINY
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver import plane
-from rxcli.receiver.channel import ObservationModel, SlotLikelihoods, by_burst, known_picture
+from rxcli.receiver.channel import ObservationModel, SlotLikelihoods, known_picture
 from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import Pose, View
-from rxcli.receiver.decode import detect
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
-from rxcli.receiver.light import MIN_VARIANCE, Crosstalk, NoiseModel, SlotLight
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MIN_VARIANCE, Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
+from rxcli.receiver.still import detected
 from rxcli.receiver.sync import tracking
-from rxcli.receiver.sync.settings import SETTINGS as SYNC
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray, Outlines
 
 
@@ -290,16 +289,13 @@ class _Observed:
 def _first_decision(columns: ColumnLight, rows: FloatArray, clock: Clock, isi_memory: int) -> Float32Array:
     """(C, N) probability that each slot is lit; each packet by itself where exposures show many slots at once."""
     positions = known_picture.row_positions(rows, clock)
-    if clock.exposure_slots <= SYNC.long_exposure_slots:
+    if clock.exposure_slots <= LONG_EXPOSURE_SLOTS:
         return known_picture.first_decision(columns, positions, clock)
     half = np.full((len(columns.value), clock.n_slots), 0.5, np.float32)
     response = known_picture.Response()
     expected = known_picture.expected_light(half, positions, clock.exposure_slots, isi_memory, response)
     metrics = known_picture.slot_likelihoods(columns, expected, clock, isi_memory).metrics
-    single = replace(clock, burst=np.arange(clock.n_copies))
-    bursts = by_burst(metrics, single)
-    posteriors = detect.detect(bursts, detect.plausible_weights(bursts, 0.0))
-    return single.on_grid(posteriors.lit)
+    return clock.by_copy.on_grid(detected(metrics, clock.by_copy, weight_margin=0.0).lit)
 
 
 def _measured(

@@ -52,6 +52,11 @@ class Reception:
     #: Skipped steps: name -> number of columns.
     skipped: dict[str, int] = field(default_factory=dict)
 
+    @property
+    def is_long(self) -> bool:
+        """Whether exposures last several slots, so that all columns were detected jointly from the start."""
+        return self.free_log_evidence is not None
+
     @cached_property
     def column_llr(self) -> FloatArray:
         """(C,) log-likelihood ratio of each column containing packets against arbitrary slots."""

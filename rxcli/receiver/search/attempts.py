@@ -9,11 +9,11 @@ from rxcli.options import ReceiverOptions
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.camera import FrameCamera
 from rxcli.receiver.frame.result import Failure, Received, failed, is_received
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.plane import orientation
 from rxcli.receiver.search.cameras import known_camera
 from rxcli.receiver.search.outlines import ON_ITS_SIDE, lean_on_its_side, unreadable_orientation
 from rxcli.receiver.search.refusal import STEADY_LIGHT, likeliest_reason
-from rxcli.receiver.sync.settings import SETTINGS as SYNC
 from rxcli.types import Frame, FrameResult
 
 _UPSIDE_DOWN = (
@@ -79,7 +79,7 @@ def _receive_stated(cache: FrameCache, options: ReceiverOptions, receive: _Recei
 def _is_long(result: FrameResult, frame: Frame, options: ReceiverOptions) -> bool:
     """Whether the stated exposure lasts several slots of the screen, so that few packets are as many as expected."""
     rate_hz = next((screen.slot_rate_hz for screen in options.screens if screen.name == result.screen_profile), 0.0)
-    return (frame.metadata.exposure_s or 0.0) * rate_hz > SYNC.long_exposure_slots
+    return (frame.metadata.exposure_s or 0.0) * rate_hz > LONG_EXPOSURE_SLOTS
 
 
 def _gives_few(result: FrameResult) -> bool:

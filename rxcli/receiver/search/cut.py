@@ -12,11 +12,11 @@ from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception, dark_columns, soft_bits
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import decode, detected_on, initial_pass
 from rxcli.receiver.sync import clock as sync
-from rxcli.receiver.sync.settings import SETTINGS as SYNC
 from rxcli.types import Clock, FrameSoftBits
 
 #: Passes made over cut packets: all columns with light.
@@ -49,10 +49,7 @@ def _candidates(context: FrameContext, screen: ScreenProfile) -> Iterator[tuple[
     exposure_slots = context.camera.exposure_s * screen.slot_rate_hz
     top, bottom = sync.row_span(profiles)
     payload_slots, n_visible = screen.packet_slots - PREAMBLE_SLOTS, (bottom - top) / rows_per_slot
-    if (
-        not SETTINGS.cut_symbols * SLOTS_PER_SYMBOL < n_visible < payload_slots
-        or exposure_slots > SYNC.long_exposure_slots
-    ):
+    if not SETTINGS.cut_symbols * SLOTS_PER_SYMBOL < n_visible < payload_slots or exposure_slots > LONG_EXPOSURE_SLOTS:
         return
     for part in range(SETTINGS.cut_phases):
         row0 = top - part / SETTINGS.cut_phases * rows_per_slot

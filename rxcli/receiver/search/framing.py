@@ -63,8 +63,7 @@ def framing_of(acquisition: Acquisition, reception: Reception, screens: Sequence
         screens: all screens that the camera may have seen.
     """
     own, llr = reception.clock, slot_llr(reception.metrics)
-    single = replace(own, burst=np.arange(own.n_copies))
-    by_copy = detect.header_llr(channel.by_burst(reception.metrics, single))
+    by_copy = detect.header_llr(channel.by_burst(reception.metrics, own.by_copy))
     headers = np.clip(by_copy, -DECODE.max_llr, DECODE.max_llr).sum(axis=1)
     header = int(headers.argmax()) * own.packet_slots - own.first_slot
     lengths = {own.packet_slots: acquisition.repeats}

@@ -14,12 +14,12 @@ from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.camera import FrameCamera
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search.cameras import known_camera, propose_cameras, relabelled_camera
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
-from rxcli.receiver.sync.settings import SETTINGS as SYNC
 from rxcli.types import Clock, RowProfiles
 
 #: Number of columns on which a clock is sought first, or the nearest available number.
@@ -120,7 +120,7 @@ class Proposer:
         with self.cache.timer("clock"):
             clock = _clock(hypothesis, profiles)
         # Through a long exposure headers stand out less, and evidence decides.
-        is_long = clock is not None and clock.exposure_slots > SYNC.long_exposure_slots
+        is_long = clock is not None and clock.exposure_slots > LONG_EXPOSURE_SLOTS
         if clock is None or clock.header_peak_ratio < (1.0 if is_long else SETTINGS.min_lead):
             return None
         lead = np.log(clock.header_peak_ratio / SETTINGS.clear_lead)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import TINY, folded, header_correlation, peak_offset
 from rxcli.protocol import EXTREMES_SLOTS, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
-from rxcli.receiver.light import dark_sigma, take_places
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MAX_EXPOSURE_SLOTS, dark_sigma, take_places
 from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
@@ -214,10 +214,10 @@ def find_clock(
     top, bottom = row_span(profiles)
     step = rows_per_slot / SETTINGS.search_samples
     n = int((bottom - top) / step)
-    if n < SLOTS_PER_SYMBOL * SETTINGS.search_samples or exposure_slots >= SETTINGS.max_exposure_slots:
+    if n < SLOTS_PER_SYMBOL * SETTINGS.search_samples or exposure_slots >= MAX_EXPOSURE_SLOTS:
         return None
     light, valid = resample(profiles, top, step, n)
-    is_long = exposure_slots > SETTINGS.long_exposure_slots
+    is_long = exposure_slots > LONG_EXPOSURE_SLOTS
     row_sigma = sigma / np.sqrt(max(step, 1.0))
     pooled, weight = (slot_differences if is_long else search_contrast)(light, valid, row_sigma)
     response = header_response(pooled, weight, SETTINGS.search_samples)

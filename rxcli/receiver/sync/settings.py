@@ -13,10 +13,6 @@ class SyncSettings:
     search_samples: int = 4
     #: Contrast, in standard deviations of a sample, at which a strip has half its full weight.
     contrast_sigmas: float = 8.0
-    #: Exposure from which headers are sought in changes of the light over a slot.
-    long_exposure_slots: float = 2.3
-    #: Exposure from which a packet's last slots reach beyond the header of the next.
-    max_exposure_slots: float = 9.5
     #: Slots of the level that changes are relative to; limit of a change, in root mean squares.
     difference_slots: int = 8
     max_difference: float = 1.5
