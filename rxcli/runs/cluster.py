@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import warnings
@@ -71,22 +72,28 @@ def _connect(address: str, connect_s: float) -> Client:
         from distributed import Client
     except ImportError:
         raise UsageError("--cluster needs the package distributed", "pip install '.[cluster]'") from None
-    made: list[Client | Exception] = []
+    made: list[Client] = []
+    failures: list[str] = []
 
     def connect() -> None:
         try:
             made.append(Client(address, timeout=connect_s, set_as_default=False))
         except Exception as error:  # Dask, its transports and TLS raise some ten unrelated types
-            made.append(error)
+            failures.append(_first_line(error))
+        if not made:
+            # A client that failed is closed here: its end and the start of another one wait for one lock of Dask, so
+            # that a later connection would hang if garbage were collected within it.
+            gc.collect()
 
     # A name that is looked up in vain, or a server that accepts and is silent, is left behind with its thread.
     connecting = Thread(target=connect, daemon=True)
     with _silent():
         connecting.start()
         connecting.join(connect_s + _MARGIN_S)
-    client = made[0] if made else TimeoutError(f"nothing within {connect_s:g} s")
-    if isinstance(client, Exception):
-        raise UsageError(f"--cluster: no Dask scheduler answers at {address!r} ({_first_line(client)})", _START_ONE)
+    if not made:
+        why = failures[0] if failures else f"nothing within {connect_s:g} s"
+        raise UsageError(f"--cluster: no Dask scheduler answers at {address!r} ({why})", _START_ONE)
+    client = made[0]
     if not client.scheduler_info()["workers"]:
         log.warning("the scheduler at %s has no workers yet; waiting for some (`dask worker %s`)", address, address)
     return client

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -51,7 +52,8 @@ def test_clips_of_long_exposures(shared_captures: Path, name: str, n_frames: int
     packets = [packet for result in results for packet in result.packets]
     assert sum(right(packet) for packet in packets) >= least
     believed = [packet for packet in packets if packet.confidence >= 0.9]
-    assert np.mean([right(packet) for packet in believed]) >= 0.97
+    doubt = sum(1 - packet.confidence for packet in believed)  # as many may be wrong, give or take a Poisson deviation
+    assert sum(not right(packet) for packet in believed) <= doubt + math.sqrt(doubt)
 
 
 @pytest.mark.parametrize("floor", FLOORS, ids=lambda floor: floor.name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
@@ -161,9 +162,16 @@ def test_taps_come_back_with_the_results_unless_they_are_too_large(
         cluster._decode(decoder, source)
 
 
-def test_a_scheduler_that_is_not_there(tmp_path: Path) -> None:
-    sources = write_orders(tmp_path)
-    with pytest.raises(UsageError, match=r"no Dask scheduler answers at 'tcp://127\.0\.0\.1:1'"):
-        next(decode_on_cluster(sources, fake_decoder(), "tcp://127.0.0.1:1", connect_s=0.5))
-    with pytest.raises(UsageError, match="no Dask scheduler answers at 'nonsense://x'"):
-        next(decode_on_cluster(sources, fake_decoder(), "nonsense://x", connect_s=0.5))
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x"])
+def test_a_scheduler_that_is_not_there(address: str, tmp_path: Path) -> None:
+    """Nothing of the attempt is left to the garbage collector: within a later connection it would lock that one up."""
+    from distributed import Client
+
+    gc.collect()
+    gc.disable()
+    try:
+        with pytest.raises(UsageError, match=f"no Dask scheduler answers at '{re.escape(address)}'"):
+            next(decode_on_cluster(write_orders(tmp_path), fake_decoder(), address, connect_s=0.5))
+        assert not [value for value in gc.get_objects() if isinstance(value, Client)]
+    finally:
+        gc.enable()

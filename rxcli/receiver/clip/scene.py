@@ -295,7 +295,7 @@ def _first_decision(columns: ColumnLight, rows: FloatArray, clock: Clock, isi_me
     response = known_picture.Response()
     expected = known_picture.expected_light(half, positions, clock.exposure_slots, isi_memory, response)
     metrics = known_picture.slot_likelihoods(columns, expected, clock, isi_memory).metrics
-    return clock.on_grid(detected(metrics, clock.by_copy, weight_margin=0.0).lit)
+    return clock.by_copy.on_grid(detected(metrics, clock.by_copy, weight_margin=0.0).lit)
 
 
 def _measured(
