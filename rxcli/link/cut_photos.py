@@ -11,7 +11,7 @@ from rxcli.link.beacons import gathered, read_words
 from rxcli.link.formats import unprotect_beacon
 from rxcli.link.layout import BEACON_LENGTHS, beacon_layout
 from rxcli.link.placement import Placement, possible_placements
-from rxcli.link.softbits import Float32, information, surprise
+from rxcli.link.softbits import Float32, information, same_bits_llr, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
 Found = tuple[tuple[MessageKind, bytes], Placement]
@@ -72,7 +72,9 @@ class CutPhotos:
         for start in range(0, len(sums), _BATCH):
             part = sums[start : start + _BATCH]
             buffers = np.stack([gathered(layout, s.total[None]) for s in part])
-            which = np.flatnonzero(information(buffers).sum(axis=1) > _TRY_FROM * layout.code.k)
+            # Bits that are sent twice agree.
+            agree = np.array([same_bits_llr(b, s.level) >= _MIN_SIMILARITY for b, s in zip(buffers, part, strict=True)])
+            which = np.flatnonzero(agree & (information(buffers).sum(axis=1) > _TRY_FROM * layout.code.k))
             words = read_words(layout, buffers[which]) if which.size else []
             for place, word in zip(which.tolist(), words, strict=True):
                 found = None if word is None else unprotect_beacon(word)
@@ -82,8 +84,11 @@ class CutPhotos:
 
 def _views(soft: FrameSoftBits) -> Iterator[_Sum]:
     """What a photograph may show: every clock, start of its packets and placement of its columns, likeliest first."""
+    of_one_packet = [
+        c for c in (soft, *soft.alternatives) if same_bits_llr(c.llr.sum(axis=0), _level(c.llr)) > _MIN_SIMILARITY
+    ]
     for group in range(3):
-        for candidate in (soft, *soft.alternatives):
+        for candidate in of_one_packet:
             llr = np.where(np.abs(candidate.llr) > _UNKNOWN, candidate.llr, 0).sum(axis=0, dtype=np.float32)
             observed, groups = np.flatnonzero(llr.any(axis=(1, 2))), possible_placements(llr)
             if observed.size == 0 or group >= len(groups):

@@ -10,7 +10,9 @@ import pytest
 from rxcli.lab.benchmark.goodput import detect
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.population import Population
+from rxcli.link import ldpc
 from rxcli.link.collector import Collector
+from rxcli.link.cut_photos import CutPhotos
 from rxcli.link.encoder import message
 from rxcli.link.placement import Placement
 from rxcli.link.receiver import LinkReceiver
@@ -71,6 +73,18 @@ def test_noise_gives_no_text() -> None:
         llr = np.zeros((1, SYMBOLS, COLUMNS, 7), np.float32)
         llr[:, :7] = rng.normal(0, 5, (1, 7, COLUMNS, 7))
         assert receiver.add(FrameSoftBits(np.arange(1), llr, number, f"{number}", open_start=True)) == []
+
+
+@pytest.mark.parametrize(("n_bursts", "n_symbols"), [(1, 11), (2, 11), (2, 5)], ids=["repeats", "bursts", "parts"])
+def test_no_code_is_tried_where_bits_that_a_text_repeats_differ(
+    n_bursts: int, n_symbols: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[object] = []
+    monkeypatch.setattr(ldpc, "decode", lambda *args, **_: tried.append(args))
+    llr = np.zeros((n_bursts, SYMBOLS, COLUMNS, 7), np.float32)
+    llr[:, :n_symbols] = np.random.default_rng(6).choice((-30, 30), (n_bursts, n_symbols, COLUMNS, 7))
+    assert CutPhotos(COLUMNS, SYMBOLS).add(FrameSoftBits(np.arange(n_bursts), llr, 0, "photo")) == []
+    assert tried == []
 
 
 def test_a_picture_without_header_gives_its_text() -> None:

@@ -297,6 +297,8 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
     Whatever the exposure, light bends between slots only: where a slot comes in, and the other way where it leaves. The
     product of both has a line at the rate of the slots, even of exposures that are not whole slots.
     """
+    import cv2
+
     black = SETTINGS.dark_share * float(np.percentile(strips.light, SETTINGS.dark_percent))
     light = np.log(np.maximum(strips.light - np.float32(black), np.float32(SETTINGS.min_light)))
     found: list[tuple[float, float]] = []
@@ -318,13 +320,14 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
         product[:, exposure:] = -columns[:, :-exposure] * columns[:, exposure:]
         # Together, and each column by itself, since the stripes of corrected pictures are bent.
         parts = product.sum(axis=0, keepdims=True), product, bends
-        spectrum = np.asarray(sum(_line_spectrum(part, lag) for part in parts))
-        frequency = np.arange(spectrum.size) / (_FINE * n)
+        size = cv2.getOptimalDFTSize(_FINE * n)
+        spectrum = np.asarray(sum(_line_spectrum(part, lag, size) for part in parts))
+        frequency = np.arange(spectrum.size) / size
         # The mosaic shows as periods of two and of four rows.
         mosaic = np.minimum(np.abs(frequency - 0.25), np.abs(frequency - 0.5)) < SETTINGS.mosaic_line
         inside = (frequency > 1 / (7 * lag)) & (frequency < 1 / (1.6 * lag)) & ~mosaic
         peaks = _peaks(np.where(inside, spectrum, 0.0), SETTINGS.n_peaks, 2 * _FINE)
-        found += [(float(spectrum[round(peak)]), _FINE * n / peak) for peak in peaks.tolist() if peak > 0]
+        found += [(float(spectrum[round(peak)]), size / peak) for peak in peaks.tolist() if peak > 0]
     distinct: list[tuple[float, float]] = []
     for strength, rows in sorted(found, reverse=True):
         if len(distinct) < SETTINGS.n_peaks and not _is_among(rows, distinct):
@@ -332,11 +335,11 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
     return distinct
 
 
-def _line_spectrum(values: Float32Array, lag: int) -> FloatArray:
-    """Power of values (C, n) over what is usual at such frequencies; places are cycles times _FINE."""
+def _line_spectrum(values: Float32Array, lag: int, size: int) -> FloatArray:
+    """Power of values (C, n) over what is usual at such frequencies; places are cycles in `size` values."""
     values = values - _blurred(values, 20 * SLOTS_PER_SYMBOL * lag // 2)
     n = values.shape[1]
-    power = np.square(np.abs(np.fft.rfft(values * np.hanning(n), _FINE * n, axis=1)))
+    power = np.square(np.abs(np.fft.rfft(values * np.hanning(n).astype(np.float32), size, axis=1)))
     spectrum = (power / (power.mean(axis=1, keepdims=True) + TINY)).sum(axis=0)
     return np.asarray(spectrum / (_blurred(spectrum[None].astype(np.float32), SETTINGS.line_bins)[0] + TINY))
 
