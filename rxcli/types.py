@@ -87,6 +87,8 @@ class Colours:
     thinned: Callable[[], Float32Array]
     #: (height, width) luma of green and blue alone, with the levels of the luma.
     without_red: Callable[[], NDArray[Any]]
+    #: The first rows of `thinned`, about a share of them; None where all take no longer.
+    first_rows: Callable[[float], Float32Array] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from rxcli.errors import InputError, reason_of
 from rxcli.ingest.luma import BT601, as_shares, luma_of, without_red
 from rxcli.ingest.quiet import quiet_libraries
 from rxcli.ingest.sniff import check_size, damage_explained
-from rxcli.types import Colours
+from rxcli.types import Colours, Float32Array
 
 #: What simplejpeg raises.
 _FAULTS = (ValueError, KeyError, MemoryError, OverflowError)
@@ -32,6 +32,8 @@ _ARITHMETIC = 0xC9
 _BLOCK = 64
 #: OpenCV's flags for a picture in colour: the means of blocks of eight by eight pixels, and all of it.
 _EIGHTH, _WHOLE = 65, 1
+#: Rows of an eighth of a picture in which its last block may end.
+_BLOCK_ROWS = 4
 #: Encoders use some ten scans, each over the whole picture, and notes some hundred segments.
 _MAX_SCANS, _MAX_SEGMENTS = 100, 1 << 14
 _SURPLUS = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
@@ -68,14 +70,23 @@ def decode_luma(data: Any, source: object, at_once: int = 1) -> NDArray[np.uint8
 def colours_of(data: bytes) -> Colours:
     """The colours of a JPEG picture whose luma was decoded, as stored."""
 
-    def decoded(size: int) -> NDArray[np.uint8]:
+    def decoded(data: bytes, size: int) -> NDArray[np.uint8]:
         import cv2
 
         with quiet_libraries():
             bgr = cv2.imdecode(np.frombuffer(data, np.uint8), size | cv2.IMREAD_IGNORE_ORIENTATION)
         return np.zeros((1, 1, 3), np.uint8) if bgr is None else np.asarray(bgr[:, :, ::-1], np.uint8)
 
-    return Colours(lambda: as_shares(decoded(_EIGHTH)), lambda: luma_of(decoded(_WHOLE), without_red(BT601)))
+    def first_rows(share: float) -> Float32Array:
+        part = decoded(data[: int(share * len(data))] + bytes((0xFF, _END)), _EIGHTH)
+        read = np.flatnonzero((part != part[-1]).any(axis=(1, 2)))  # Rows of blocks that are missing are level.
+        return as_shares(part[: max(read.size and int(read[-1]) + 1 - _BLOCK_ROWS, 0)])
+
+    return Colours(
+        lambda: as_shares(decoded(data, _EIGHTH)),
+        lambda: luma_of(decoded(data, _WHOLE), without_red(BT601)),
+        first_rows if frame_of(data)[3] else None,
+    )
 
 
 def frame_of(data: bytes) -> tuple[int, int, float, bool]:

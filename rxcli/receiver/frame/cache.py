@@ -49,7 +49,8 @@ class FrameCache:
     def in_blinking_colours(self) -> FrameCache:
         """The same picture, in green and blue alone if its red lags behind the slots."""
         with self.timer("geometry"):
-            contrast = red_contrast(self.frame) if may_lag(self.plane) else None
+            share = may_lag(self.plane)
+            contrast = red_contrast(self.frame, share) if share else None
             frame = in_blinking_colours(self.frame, contrast)
         return self if frame is self.frame else FrameCache(frame, self.timer)
 

@@ -19,6 +19,8 @@ from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
 _N_CELLS, _CELL_PX, _BLOCK_ROWS = 48, 12, 96
 #: Light of dark slots over that of lit ones up to which red blinks, or hardly counts.
 _PLAIN_DARK = 0.02
+#: Shares of the stripes and of the rows of a picture in which a contrast of red from here on shows that it blinks.
+_ENOUGH_STRIPES, _ENOUGH_ROWS, _PLAINLY = 0.3, 0.3, 0.75
 #: Red blinks or not, with a contrast of 1 or 0, whichever is nearer; standard errors at which the other is excluded.
 _MIDDLE, _SURE = 0.5, 3.0
 #: Values of a colour, of the largest one, that are too dark to compare, and from which they may be clipped.
@@ -27,18 +29,27 @@ _DARK, _CLIPPED = 0.01, 0.98
 _LEFT_OUT = float("inf")
 
 
-def may_lag(plane: LightPlane) -> bool:
-    """Whether the dark slots of a picture leave as much luma as red does that lags."""
+def may_lag(plane: LightPlane) -> float:
+    """Share of a picture's rows, from the top, that is enough to see whether red lags.
+
+    They show a part of the stripes, and so not the texture above the screen alone. 0 where the dark slots leave less
+    luma than red that lags.
+    """
     n_cells = len(plane.sums) - 1
     width, n_blocks = max(_CELL_PX // plane.cell_px, 1), plane.height // _BLOCK_ROWS
     if n_cells < width or not n_blocks:
-        return False
+        return 0.0
     left = np.linspace(0, n_cells - width, _N_CELLS).astype(int)
     rows = slice(n_blocks * _BLOCK_ROWS)
     values = (plane.sums[left + width, rows] - plane.sums[left, rows]) / np.float32(width * plane.cell_px)
     blocks = light_of(plane, values, "srgb").reshape(_N_CELLS, n_blocks, -1)
     dark, lit = blocks.min(axis=2), np.maximum(blocks.max(axis=2), np.float32(_PLAIN_DARK**2))
-    return bool(np.median((dark / lit)[lit >= np.median(lit)]) > _PLAIN_DARK)
+    if np.median((dark / lit)[lit >= np.median(lit)]) <= _PLAIN_DARK:
+        return 0.0
+    steps = np.diff(values)
+    stripes = np.maximum((steps[1:] * steps[:-1]).sum(axis=0), 0).cumsum()
+    share = float(np.searchsorted(stripes, _ENOUGH_STRIPES * stripes[-1]) + _BLOCK_ROWS) / plane.height
+    return max(share, _ENOUGH_ROWS)
 
 
 def in_blinking_colours(frame: Frame, contrast: tuple[float, float] | None) -> Frame:
@@ -59,17 +70,24 @@ def in_one_mix(frames: Iterable[Frame]) -> Iterator[Frame]:
         yield in_blinking_colours(frame, contrast)
 
 
-def red_contrast(frame: Frame) -> tuple[float, float] | None:
+def red_contrast(frame: Frame, share: float = 1.0) -> tuple[float, float] | None:
     """Contrast of the slots in red relative to green, with its standard deviation.
 
-    None if neither light that blinks nor light that does not is ruled out: without colours, or without slots.
+    None if neither light that blinks nor light that does not is ruled out: without colours, or without slots. Where this
+    share of a picture's rows shows that red blinks, the others are not read.
     """
     if frame.mosaic is not None:
-        thinned = _thinned(frame, frame.mosaic)
-    elif frame.colours is not None:
-        thinned = frame.colours.thinned()
-    else:
+        return _contrast(_thinned(frame, frame.mosaic))
+    if frame.colours is None:
         return None
+    if share < 1 and frame.colours.first_rows is not None:
+        of_part = _contrast(frame.colours.first_rows(share))
+        if of_part is not None and of_part[0] > _PLAINLY:
+            return of_part
+    return _contrast(frame.colours.thinned())
+
+
+def _contrast(thinned: Float32Array) -> tuple[float, float] | None:
     if thinned.shape[1] < _N_CELLS or len(thinned) < 2:
         return None
     import cv2

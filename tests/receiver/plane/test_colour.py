@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import av
 import cv2
@@ -13,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rxcli.ingest import open_source
+from rxcli.ingest.jpeg import colours_of as jpeg_colours_of
 from rxcli.ingest.luma import BT601, BT709, colours_of, luma_of, without_red
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.plane import in_blinking_colours, in_one_mix, may_lag, read_plane, red_contrast
@@ -54,6 +56,19 @@ def test_red_that_lags_is_left_out(make: Any, red_blinks: float) -> None:
     cache = FrameCache(frame).in_blinking_colours()
     assert (cache.frame is frame) == (red_blinks == 1)
     assert cache.frame.red_contrast == (None if red_blinks == 1 else contrast)
+
+
+@pytest.mark.parametrize(("red_blinks", "is_whole_read"), [(1.0, False), (0.1, True)])
+def test_the_first_rows_of_a_jpeg_show_that_red_blinks(red_blinks: float, is_whole_read: bool) -> None:
+    jpeg = cv2.imencode(".jpg", striped(red_blinks)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
+    stored = jpeg_colours_of(jpeg.tobytes())
+    assert stored.first_rows is not None
+    first_rows, every = stored.first_rows(0.5), stored.thinned()
+    assert 0.4 * len(every) < len(first_rows) < 0.6 * len(every)
+    np.testing.assert_array_equal(first_rows, every[: len(first_rows)])
+    whole = Mock(side_effect=stored.thinned)
+    red_contrast(Frame(np.zeros((8, 8), np.uint8), "memory", colours=replace(stored, thinned=whole)), 0.5)
+    assert whole.called == is_whole_read
 
 
 def test_what_is_left_is_luma_of_green_and_blue() -> None:
