@@ -73,7 +73,7 @@ def in_one_mix(frames: Iterable[Frame]) -> Iterator[Frame]:
 def red_contrast(frame: Frame, share: float = 1.0) -> tuple[float, float] | None:
     """Contrast of the slots in red relative to green, with its standard deviation.
 
-    None if neither light that blinks nor light that does not is ruled out: without colours, or without slots. Where this
+    None if neither light that blinks nor light that does not is ruled out: without colours, or without slots. If this
     share of a picture's rows shows that red blinks, the others are not read.
     """
     if frame.mosaic is not None:
