@@ -12,15 +12,18 @@ from numpy.typing import NDArray
 
 from rxcli.link import ldpc
 from rxcli.link.formats import unprotect_beacon
+from rxcli.link.known_bits import KnownBits, known_bits
 from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
 from rxcli.link.placement import Placement, possible_placements
-from rxcli.link.softbits import Float32, information, log_likelihood, same_bits_llr, surprise
+from rxcli.link.softbits import Float32, log_likelihood, same_bits_llr, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
 #: Information at which a beacon is first decoded, its increase before the next attempt, and the upper limit; relative
 #: to the beacon's bits.
 _TRY_FROM, _RETRY_GAIN, _TRY_UP_TO = 1.02, 0.08, 2.5
-_ITERATIONS = 25
+#: Bits that must be observed, relative to the beacon's: the others may be known.
+_MIN_OBSERVED = 0.5
+_ITERATIONS = 40
 #: Log-likelihood ratio below which bursts, or copies within one burst, do not carry the same message.
 _MIN_SIMILARITY = -8.0
 #: Log-likelihood ratio above which bursts are copies of each other.
@@ -180,7 +183,7 @@ class BeaconSearch:
         groups = possible_placements(candidate.total)
         if settled is not None:
             groups = [[settled.after(candidate.placement.inverse)]]
-        layouts = [layout for layout in self._layouts[period] if n_observed >= _TRY_FROM * layout.code.k]
+        layouts = [layout for layout in self._layouts[period] if n_observed >= _MIN_OBSERVED * layout.code.k]
         for number, layout, phase in product(range(len(groups)), layouts, range(period)):
             for placement, found in self._tried(candidate, layout, phase, number, groups[number]):
                 candidate.settle(found, placement)
@@ -206,7 +209,8 @@ class BeaconSearch:
         if last >= _TRY_UP_TO:
             return
         buffers = np.stack([gathered(layout, placement.of(total)) for placement in placements])
-        bits = information(buffers).sum(axis=1) / layout.code.k
+        known = known_bits(layout, buffers)
+        bits = known.information(buffers) / layout.code.k
         alone = float(candidate.levels.sum())
         possible = np.array([same_bits_llr(buffer, alone) >= _MIN_SIMILARITY for buffer in buffers])
         which = np.flatnonzero(possible & (bits >= min(last + _RETRY_GAIN, _TRY_UP_TO)))
@@ -214,7 +218,7 @@ class BeaconSearch:
             return
         candidate.tried[key] = float(bits[which].max())
         self._fruitless[len(candidate.total)] += 1
-        for place, word in zip(which.tolist(), read_words(layout, buffers[which]), strict=True):
+        for place, word in zip(which.tolist(), read_words(layout, buffers[which], known=known.of(which)), strict=True):
             found = None if word is None else unprotect_beacon(word)
             if found is not None:
                 yield placements[place], found
@@ -226,23 +230,29 @@ def gathered(layout: BeaconLayout, llr: Float32) -> Float32:
 
 
 def read_words(
-    layout: BeaconLayout, buffers: Float32, check: Callable[[bytes], object] = unprotect_beacon
+    layout: BeaconLayout,
+    buffers: Float32,
+    check: Callable[[bytes], object] = unprotect_beacon,
+    known: KnownBits | None = None,
 ) -> list[bytes | None]:
     """Decode buffers (n, n_bits) of a layout; None if no sufficiently likely word is found."""
+    n_known = np.zeros(len(buffers)) if known is None else known.n_bits
+    llr = buffers if known is None else buffers + known.sent
+    unsent = None if known is None else ldpc.quantised(known.unsent)
     found: list[bytes | None] = [None] * len(buffers)
 
     def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:
         good = np.zeros(places.size, bool)
         for i, (place, coded) in enumerate(zip(places, np.packbits(bits, axis=1), strict=True)):
-            if check(coded.tobytes()) is not None and is_likely(layout, bits[i], buffers[place]):
+            if check(coded.tobytes()) is not None and is_likely(layout, bits[i], buffers[place], n_known[place]):
                 found[place], good[i] = coded.tobytes(), True
         return good
 
-    ldpc.decode(layout.code, ldpc.quantised(buffers), accepted, _ITERATIONS, gives_up=True)
+    ldpc.decode(layout.code, ldpc.quantised(llr), accepted, _ITERATIONS, gives_up=True, unsent_llr=unsent)
     return found
 
 
-def is_likely(layout: BeaconLayout, information_bits: NDArray[np.uint8], buffer: Float32) -> bool:
-    """Whether a decoded word agrees with the soft bits."""
+def is_likely(layout: BeaconLayout, information_bits: NDArray[np.uint8], buffer: Float32, n_known: float = 0.0) -> bool:
+    """Whether a decoded word agrees with the soft bits, from which its known bits do not follow."""
     word = ldpc.encode(layout.code, np.asarray(information_bits, np.uint8)[None])[0, : buffer.size]
-    return bool(log_likelihood(word, buffer) > _MIN_LIKELIHOOD * layout.code.k * np.log(2.0))
+    return bool(log_likelihood(word, buffer) > _MIN_LIKELIHOOD * (layout.code.k - n_known) * np.log(2.0))

@@ -9,9 +9,10 @@ import numpy as np
 
 from rxcli.link.beacons import gathered, read_words
 from rxcli.link.formats import unprotect_beacon
+from rxcli.link.known_bits import known_bits
 from rxcli.link.layout import BEACON_LENGTHS, beacon_layout
 from rxcli.link.placement import Placement, possible_placements
-from rxcli.link.softbits import Float32, information, same_bits_llr, surprise
+from rxcli.link.softbits import Float32, same_bits_llr, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
 Found = tuple[tuple[MessageKind, bytes], Placement]
@@ -74,8 +75,9 @@ class CutPhotos:
             buffers = np.stack([gathered(layout, s.total[None]) for s in part])
             # Bits that are sent twice agree.
             agree = np.array([same_bits_llr(b, s.level) >= _MIN_SIMILARITY for b, s in zip(buffers, part, strict=True)])
-            which = np.flatnonzero(agree & (information(buffers).sum(axis=1) > _TRY_FROM * layout.code.k))
-            words = read_words(layout, buffers[which]) if which.size else []
+            known = known_bits(layout, buffers)
+            which = np.flatnonzero(agree & (known.information(buffers) > _TRY_FROM * layout.code.k))
+            words = read_words(layout, buffers[which], known=known.of(which)) if which.size else []
             for place, word in zip(which.tolist(), words, strict=True):
                 found = None if word is None else unprotect_beacon(word)
                 if found is not None:

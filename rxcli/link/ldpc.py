@@ -171,6 +171,7 @@ def decode(
     accept: Accept,
     max_iterations: int = 22,
     gives_up: bool = False,
+    unsent_llr: NDArray[np.int8] | None = None,
 ) -> NDArray[np.bool_]:
     """Decode a batch of blocks by layered normalised min-sum in 16-bit numbers, until `accept` accepts them.
 
@@ -182,12 +183,16 @@ def decode(
         accept: called after every iteration with batch indices and information bits.
         max_iterations: maximum number of iterations.
         gives_up: whether a block that looks like no codeword is given up before all iterations.
+        unsent_llr: (batch, first_sent) likewise of the bits that are never sent, if anything is known of them.
 
     Returns:
         (batch,) which blocks were accepted.
     """
     n_rows = code.rows_for(buffer_llr.shape[1])
-    layers = _Layers(code, n_rows, _decoder_input(code, buffer_llr, n_rows))
+    total = _decoder_input(code, buffer_llr, n_rows)
+    if unsent_llr is not None:
+        total[: code.first_sent] = -unsent_llr.T.astype(np.int16)
+    layers = _Layers(code, n_rows, total)
     places = np.arange(buffer_llr.shape[0])
     accepted = np.zeros(places.size, bool)
     still = np.ones(places.size, bool)

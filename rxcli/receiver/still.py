@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rxcli.errors import ReceiverError
 from rxcli.numerics import box_sums
 from rxcli.options import ReceiverOptions
-from rxcli.protocol import SLOTS_PER_SYMBOL
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel
 from rxcli.receiver.channel import denoise, ratios
 from rxcli.receiver.decode import detect, survivors
@@ -199,8 +199,11 @@ def follow_picture(acquisition: Acquisition, reception: Reception, columns: NDAr
     lit = clock.on_grid(reception.posteriors.lit)
     bursts = ratios.burst_samples(samples, clock, model.black_level, model.noise, model.crosstalk, columns, lit)
     if not reception.is_long:
-        prior = np.maximum(reception.posteriors.w_log_prob[columns], STILL.min_weight_log_prior) / bursts.n_bursts
-        bursts = replace(bursts, w_log_prior=np.tile(prior, (bursts.n_bursts, 1)))
+        # Paths that see nothing of a packet's start would keep the weights of fewest words.
+        dimming = reception.n_observed[:, columns, SLOTS_PER_SYMBOL:PREAMBLE_SLOTS].sum(axis=2, keepdims=True)
+        least = np.where(dimming > 0, STILL.min_weight_log_prior, STILL.no_weight)
+        prior = np.maximum(reception.posteriors.w_log_prob[columns], least) / bursts.n_bursts
+        bursts = replace(bursts, w_log_prior=prior.reshape(-1, len(WEIGHTS)))
     found = survivors.detect(bursts)
     header_llr, log_prob = reception.posteriors.header_llr[:, columns], found.log_prob
     if reception.is_long:  # Where arbitrary slots explain a column as well, it may have no packets.

@@ -49,7 +49,7 @@ def test_one_photo_that_shows_most_of_a_packet_gives_its_text(first: int, placem
 
 def test_photos_of_different_parts_add_up() -> None:
     receiver, rng = LinkReceiver(COLUMNS, SYMBOLS), np.random.default_rng(3)
-    came = [receiver.add(photo(range(k, k + 5), rng, number=k)) for k in (1, 5)]
+    came = [receiver.add(photo(range(k, k + 3), rng, number=k)) for k in (1, 5)]
     assert [len(events) for events in came] == [0, 1]
     assert receiver.messages[0].text == TEXT
 
@@ -87,7 +87,9 @@ def test_no_code_is_tried_where_bits_that_a_text_repeats_differ(
     assert tried == []
 
 
-def test_a_picture_without_header_gives_its_text() -> None:
+#: Slot at the first row, and whether no header is in view: five slots of the packet before are, of the second.
+@pytest.mark.parametrize(("start_slot", "is_open"), [(12.0, True), (112.0, False)])
+def test_a_picture_of_less_than_a_packet_gives_its_text(start_slot: float, is_open: bool) -> None:
     rng = np.random.default_rng(4)
     drawn = Population(
         screens=("data-17k3",),
@@ -99,11 +101,11 @@ def test_a_picture_without_header_gives_its_text() -> None:
         aim=0,
     )
     scene, _ = drawn.draw(rng)
-    scene = replace(scene, labels=message("hello there"), start_slot=12.0, w=5)
+    scene = replace(scene, labels=message("hello there"), start_slot=start_slot, w=5)
     trial = simulate_trial(scene, 1)
     known = ReceiverOptions(screens=(scene.screen,), cameras=(trial.camera,), force_camera=True, corners=trial.corners)
     result = _receive_still(FrameCache(trial.frame), replace(known, soft_bits=True)).result
     assert not result.packets
     assert result.soft_bits is not None
-    assert result.soft_bits.open_start
+    assert result.soft_bits.open_start == is_open
     assert [m.text for m in Collector([scene.screen]).add(result).messages] == ["hello there"]

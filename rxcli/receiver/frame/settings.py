@@ -42,6 +42,8 @@ class StillSettings:
     max_column_gain: float = 40.0
     #: Least log probability of a weight by the initial pass that the joint detection starts from.
     min_weight_log_prior: float = -3.0
+    #: The same of packets whose dimming symbol is out of view.
+    no_weight: float = -40.0
     #: Minimum confidence of a packet that the auto-encoder corrected.
     min_corrected_confidence: float = 0.1
     #: Confidence of a packet below which its column gets further passes.
