@@ -16,8 +16,7 @@ def test_exit_codes_of_the_command_line() -> None:
 
 
 @pytest.mark.parametrize(
-    ("codes", "expected"),
-    [([], 0), ([0, 0], 0), ([0, 1], 1), ([1, 3], 3), ([3, 2, 1], 2), ([1, 2, 3, 130, 0], 130)],
+    ("codes", "expected"), [([], 0), ([0, 0], 0), ([0, 1], 1), ([1, 3], 3), ([3, 2, 1], 2), ([1, 2, 3, 130, 0], 130)]
 )
 def test_where_several_hold_the_first_of_130_2_3_1_wins(codes: list[int], expected: int) -> None:
     assert worst([ExitCode(code) for code in codes]) == expected

@@ -170,8 +170,7 @@ def autoregressive(n: int, rng: np.random.Generator) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("duty", "noise", "gain", "least"),
-    [(0.5, 0.05, 0.5, 51), (None, 0.3, 0.4, 51), (None, None, 10.0, 50)],
+    ("duty", "noise", "gain", "least"), [(0.5, 0.05, 0.5, 51), (None, 0.3, 0.4, 51), (None, None, 10.0, 50)]
 )
 def test_the_interval_holds_as_often_as_it_says(duty: Any, noise: Any, gain: float, least: int) -> None:
     """Of 60 intervals of 95 % at least 51 hold (fewer: 1 in 2000), and they are not needlessly wide.

@@ -228,16 +228,6 @@ def test_the_packets_of_a_killed_run_stand_once(tmp_path: Path, folder: Path, de
     assert "/dev/full: cannot be written (No space left on device)" in said
 
 
-def test_a_resumed_file_is_that_of_an_undisturbed_run(tmp_path: Path, folder: Path, decode: Decode) -> None:
-    whole, cut = tmp_path / "whole.jsonl", tmp_path / "cut.jsonl"
-    assert decode(folder, "--json", whole)[0] == 0
-    data = whole.read_bytes()
-    for length in (0, 1, len(data) // 2, len(data) - 1, len(data)):
-        cut.write_bytes(data[:length])
-        assert decode(folder, "--json", cut, "--resume")[0] == 0
-        assert records(cut) == records(whole)
-
-
 @pytest.mark.parametrize(
     "change",
     [

@@ -14,13 +14,7 @@ import pytest
 from rxcli.errors import InputError, UsageError
 from rxcli.lab.benchmark.goodput import detect
 from rxcli.link import ldpc
-from rxcli.link.encoder import (
-    FileSending,
-    MessageSending,
-    file_object,
-    message,
-    packet_slots_of,
-)
+from rxcli.link.encoder import FileSending, MessageSending, file_object, message, packet_slots_of
 from rxcli.link.files import FilesUnderWay
 from rxcli.link.formats import protect
 from rxcli.link.layout import announcement_layout

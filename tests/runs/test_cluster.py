@@ -28,10 +28,7 @@ from rxcli.types import Frame, FrameResult
 
 pytest.importorskip("distributed", reason="dask.distributed is not installed (extra cluster)")
 
-QUIET = {
-    "DASK_DISTRIBUTED__SCHEDULER__DASHBOARD__ENABLED": "False",
-    "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "5s",
-}
+QUIET = {"DASK_DISTRIBUTED__SCHEDULER__DASHBOARD__ENABLED": "False", "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "5s"}
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -290,21 +291,17 @@ def replace_weights(model: Path, data: bytes) -> None:
     edit(model, before, hashlib.sha256(data).hexdigest())
 
 
-def test_a_missing_model_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ProfileError, match=r"nowhere.*no model can be read there.*vlc-rx train"):
-        load_denoiser(str(tmp_path / "nowhere"))
-
-
-def test_missing_weights_are_named(model: Path) -> None:
-    (model / "model.onnx").unlink()
-    with pytest.raises(ProfileError, match=r"model\.onnx: cannot be read"):
-        load_denoiser(str(model))
-
-
-def test_cut_weights_do_not_match_their_checksum(model: Path) -> None:
-    weights = model / "model.onnx"
-    weights.write_bytes(weights.read_bytes()[:-100])
-    with pytest.raises(ProfileError, match=r"does not match the checksum"):
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (shutil.rmtree, r"no model can be read there.*vlc-rx train"),
+        (lambda model: (model / "model.onnx").unlink(), r"model\.onnx: cannot be read"),
+        (lambda model: (model / "model.onnx").write_bytes(b"cut"), "does not match the checksum"),
+    ],
+)
+def test_what_is_missing_or_cut_is_named(damage: Callable[[Path], object], told: str, model: Path) -> None:
+    damage(model)
+    with pytest.raises(ProfileError, match=rf"{model}.*{told}"):
         load_denoiser(str(model))
 
 
