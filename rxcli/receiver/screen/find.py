@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import TINY
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import find_combs, grid_of_comb
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
@@ -39,6 +39,8 @@ _FIRST_STEPS, _LAST_STEPS = 3, 2
 #: Contrast of the strongest comb, as a share of the light it explains, from which no further combs are tried; number of
 #: combs that are fitted otherwise.
 _PLAIN_CONTRAST, _N_FITTED = 0.2, 3
+#: Contrast of one screen's grid, as a share of that of two, from which there is one: over two it has that of one alone.
+_ONE_SCREEN = 0.9
 #: Contrast, times what chance gives, from which packets are looked for; of a part of a picture it must be plainer.
 _POSSIBLE_CONTRAST = 0.5
 #: Share of the best grid's score from which a second one is proposed, and its log-odds: it is right in one picture of
@@ -117,11 +119,18 @@ def _strips_of(plane: LightPlane, lens: Lens | None) -> PictureStrips | None:
 
 def _screens_apart(strips: PictureStrips, layouts: Sequence[ColumnLayout]) -> list[list[Outline]]:
     """Candidate outlines of two screens side by side, or none: together they light more columns than one has."""
-    sides = strips.sides_of_gap()
+
+    def n_lit(part: PictureStrips, grid: Grid) -> float:
+        return float(np.ptp(_light_across(part, grid, layouts[0].sigma)[1].ends))
+
+    sides, too_many = strips.sides_of_gap(), max(layout.n_columns for layout in layouts) + 1
     found = [(side, grid) for side in sides for grid in wide_grids(side, layouts[0].sigma)[:1]]
-    n_lit = sum(np.ptp(_light_across(side, grid, layouts[0].sigma)[1].ends) for side, grid in found)
-    if len(found) < 2 or n_lit < max(layout.n_columns for layout in layouts) + 1:
+    if len(found) < 2 or sum(n_lit(side, grid) for side, grid in found) < too_many:
         return []
+    together = sum(grid.contrast for _, grid in found)
+    for grid in wide_grids(strips, layouts[0].sigma)[:1]:
+        if grid.contrast > _ONE_SCREEN * together and n_lit(strips, grid) < too_many:
+            return []
     clearest_first = sorted(found, key=lambda side_and_grid: -side_and_grid[1].explained)
     return [_numbered(side, grid, layouts) for side, grid in clearest_first]
 
@@ -196,15 +205,16 @@ def wide_grids(strips: PictureStrips, sigma: float, rivals: Sequence[Grid] = (),
     near = [moved_by_waveforms(some, grid, sigma, _FIRST_STEPS) for grid in starts]
     fitted = [with_light(strips, moved_by_waveforms(strips, grid, sigma, _LAST_STEPS), sigma) for grid in near]
     found = sorted((grid for grid in fitted if _stands_out(strips, grid, least)), key=_score, reverse=True)
-    second = (
-        grid for grid in found[1:] if _score(grid) > _NEARLY_BEST * _score(found[0]) and _differ(strips, grid, found[0])
-    )
-    return [*found[:1], *islice(second, 1)]
+    rivals = [grid for grid in found if _differ(strips, grid, found[0])]
+    same = (grid for grid in found if not _differ(strips, grid, found[0]))
+    # Of grids with the same columns the likeliest is nearest to them.
+    best = [max(same, key=lambda grid: grid.explained + grid.contrast)] if found else []
+    return best + [grid for grid in rivals if _score(grid) > _NEARLY_BEST * _score(found[0])][:1]
 
 
 def _score(grid: Grid) -> float:
-    """Log-likelihood by which grids are compared."""
-    return grid.explained + grid.contrast
+    """Contrast by which grids are compared; narrower columns explain more light, above all where it spreads far."""
+    return grid.contrast / float(np.sqrt(max(grid.explained, TINY)))
 
 
 def _differ(strips: PictureStrips, grid: Grid, rival: Grid) -> bool:

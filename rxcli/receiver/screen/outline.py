@@ -44,6 +44,11 @@ class Outline:
         return self.grid.estimated_lens if self.grid else None
 
     @property
+    def contrast(self) -> float:
+        """Log-likelihood by which its columns' borders stand out; 0 where it was given."""
+        return self.grid.contrast if self.grid else 0.0
+
+    @property
     def result_fields(self) -> dict[str, Any]:
         """Fields of a result, by name."""
         return {

@@ -188,18 +188,20 @@ def lean_on_its_side(cache: FrameCache, options: ReceiverOptions) -> float:
     frame is examined.
     """
     layouts = [layout for layout in layouts_of(options) if not layout.is_narrow]
-    return cache.once(("lean", *layouts), lambda: _lean(cache, layouts))
+    upright = max((screen[0].contrast for screen in possible_screens(cache, options)), default=0.0)
+    return cache.once(("lean", *layouts), lambda: _lean(cache, layouts, upright))
 
 
-def _lean(cache: FrameCache, layouts: list[find.ColumnLayout]) -> float:
+def _lean(cache: FrameCache, layouts: list[find.ColumnLayout], upright: float) -> float:
+    """`lean_on_its_side` of a picture whose upright columns have a contrast of `upright`."""
     frame = cache.frame
     if frame.index or not may_fill(frame) or frame.mosaic is not None:
         return 0.0
     plane = turned(cache.plane)
-    screens = find.find_screens(plane, layouts)
-    corners = next((screen[0].corners for screen in screens if screen[0].stands_out), None)
-    if corners is None:
+    lying = next(iter(find.find_screens(plane, layouts)), [])
+    if not lying or not lying[0].stands_out or lying[0].contrast < upright:
         return 0.0
+    corners = lying[0].corners
     # Rows of the turned plane are columns of the picture.
     shares = np.clip(corners[:, ::-1] / [plane.height, plane.width], 0, 1)
     lean = stripe_lean(part_of(frame.pixels, shares * [frame.width, frame.height]))

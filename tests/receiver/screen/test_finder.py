@@ -22,7 +22,7 @@ from rxcli.receiver.screen.find import (
     why_useless,
     wide_grids,
 )
-from rxcli.receiver.screen.grid import columns_at, grid_between
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
 from rxcli.receiver.screen.numbering import (
     LightProfile,
     first_column_features,
@@ -33,7 +33,7 @@ from rxcli.receiver.screen.numbering import (
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.screen.rows import lit_range
-from rxcli.receiver.screen.strips import read_strips, shows_narrow_columns
+from rxcli.receiver.screen.strips import PictureStrips, read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
 from rxcli.types import Clock, FloatArray, Frame, Lens, LightPlane, Mosaic
 
@@ -94,6 +94,8 @@ def shown(picture: str, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArr
         return ((v > 0.13) & (v < 0.87)).astype(np.float32)
     if picture == "film":
         return ((u > 0.13) & (u < 0.87)).astype(np.float32)
+    if picture == "gap":
+        return (np.abs(u - 0.47) > 0.1).astype(np.float32)
     if picture == "dark sides":
         return ((u > 0.18) & (u < 0.86)).astype(np.float32)
     if picture == "fading":
@@ -296,6 +298,34 @@ def test_a_second_grid_is_proposed_where_it_does_nearly_as_well(monkeypatch: pyt
     assert second.log_odds == -25
     off = [apart(one) - np.round(np.median(apart(one))) for one in (outlines[0], second)]
     assert np.abs(off[0]).max() < 0.2 < np.abs(off[1]).max()
+
+
+def test_narrower_columns_that_explain_more_light_but_stand_out_less_lose(monkeypatch: pytest.MonkeyPatch) -> None:
+    strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    rivals = [replace(true, coefficients=true.coefficients * np.array([1, share, 1, 1, 1, 1])) for share in (1, 1.2)]
+    lights = {grid.pitch_px: light for grid, light in zip(rivals, ((34090, 2948), (35973, 2634)), strict=True)}
+
+    def lit(_: PictureStrips, grid: Grid, __: float) -> Grid:
+        explained, contrast = lights[grid.pitch_px]
+        return replace(grid, explained=explained, contrast=contrast)
+
+    monkeypatch.setattr(find, "find_combs", lambda *_: [])
+    monkeypatch.setattr(find, "moved_by_waveforms", lambda _, grid, *__: grid)
+    monkeypatch.setattr(find, "with_light", lit)
+    (chosen,) = wide_grids(strips, 0.45, rivals)
+    assert chosen.pitch_px == true.pitch_px
+
+
+def test_one_grid_over_a_dark_gap_is_one_screen(monkeypatch: pytest.MonkeyPatch) -> None:
+    plane, n_strips = drawn("gap"), read_strips(drawn("gap")).coherence.shape[1]
+
+    def too_narrow_at_a_side(strips: PictureStrips, *rest: Any) -> list[Grid]:
+        grids, share = wide_grids(strips, *rest), 1.0 if strips.coherence.shape[1] == n_strips else 1.5
+        return [replace(grid, coefficients=grid.coefficients * np.array([1, share, 1, 1, 1, 1])) for grid in grids]
+
+    monkeypatch.setattr(find, "wide_grids", too_narrow_at_a_side)
+    (outlines,) = find_screens(plane, [WIDE])
+    assert np.abs(apart(outlines[0])).max() < 0.3
 
 
 def profile_of(picture: str) -> LightProfile:

@@ -192,3 +192,14 @@ def test_the_budget_bounds_the_passes() -> None:
     found = search(FrameCache(trial.frame), replace(trial.options(), screens=SHIPPED), budget=1)
     assert isinstance(found, Found)
     assert len(found.tried) == 1
+
+
+@pytest.mark.parametrize(("upright", "lean"), [(5.0, 0.5), (20.0, 0.0)])
+def test_columns_that_stand_out_more_upright_do_not_lie_on_their_side(
+    monkeypatch: pytest.MonkeyPatch, upright: float, lean: float
+) -> None:
+    corners = np.array([[40.0, 40.0], [200.0, 40.0], [200.0, 130.0], [40.0, 130.0]])
+    lying = Outline(corners, grid=replace(grid_between(corners, 20, (240, 200), None), contrast=10.0))
+    monkeypatch.setattr(outlines.find, "find_screens", lambda *_: [[lying]])
+    monkeypatch.setattr(outlines, "stripe_lean", lambda _: 0.5)
+    assert outlines._lean(FrameCache(Frame(np.zeros((200, 240), np.uint8), "memory")), [], upright) == lean
