@@ -12,7 +12,7 @@ import os
 import re
 import stat
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -104,17 +104,17 @@ class Taken:
 
 
 def claim(
-    outputs: Sequence[Output],
+    outputs: Iterable[Output | None],
     inputs: Iterable[str | Path] = (),
-    profiles: Iterable[str | Path] = (),
+    profiles: Iterable[str | Path | None] = (),
     force: bool = False,
 ) -> Taken:
     """Refuse outputs that would destroy something or cannot be written; existing files are not touched.
 
     Args:
-        outputs: all files that the run will write.
+        outputs: all files that the run will write; None where an option was not given.
         inputs: files that the run reads; missing ones are ignored.
-        profiles: profile files that the run reads.
+        profiles: names and files of profiles that the run reads, likewise.
         force: replace foreign files, but never an input or a profile of this run.
 
     Returns:
@@ -127,10 +127,10 @@ def claim(
     """
     taken = Taken()
     for kind, paths in (("an input", inputs), ("a profile that is read", profiles)):
-        for path in map(Path, paths):
+        for path in (Path(path) for path in paths if path):
             if _identity(path) is not None:
                 taken.add(path, kind)
-    for output in outputs:
+    for output in filter(None, outputs):
         _check_place(output)
         if is_stream(output.path):
             continue

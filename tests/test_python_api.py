@@ -194,7 +194,6 @@ def test_what_is_received_is_a_path_or_several_pictures(source: Any) -> None:
     [
         *(lambda name=name: rxcli.load_profile(name) for name in (None, 5, [], "")),
         lambda: rxcli.load_profile("xs10", int),  # type: ignore[type-var]
-        lambda: rxcli.Receiver.with_options(None),  # type: ignore[arg-type]
         *(lambda path=path: next(iter(rxcli.open_source(path))) for path in (None, 5, [], "")),
         *(lambda bits=bits: rxcli.encode_packet(bits, 5) for bits in (None, "0101010", [2] * 7, [[0] * 7])),
     ],
@@ -234,8 +233,10 @@ class Recorder:
 
 def test_a_denoiser_may_be_ones_own() -> None:
     recorder = Recorder()
-    options = replace(KNOWN.options, cae="always", denoiser=recorder)
-    result = rxcli.Receiver.with_options(options).decode(PHOTO)
+    own = rxcli.Receiver(
+        screens="paper-17k3", cameras=str(SAMPLES / "xs10-small.toml"), cae="always", denoiser=recorder
+    )
+    result = own.decode(PHOTO)
     assert recorder.columns == list(range(20))
     assert result.denoiser is not None
     assert result.denoiser["model"] == "recorder"

@@ -1,4 +1,4 @@
-"""Conversion of frames for calibration: light for stripes, grey pictures for boards."""
+"""Light of a frame, for the stripes of lamps."""
 
 from __future__ import annotations
 
@@ -35,20 +35,3 @@ def _colours(mosaic: Mosaic, height: int, width: int) -> NDArray[np.uint8]:
     """(height, width) colour of each pixel."""
     rows, columns = mosaic.pattern.shape
     return np.tile(mosaic.pattern, (height // rows + 1, width // columns + 1))[:height, :width]
-
-
-def gray_of(frame: Frame) -> NDArray[np.uint8]:
-    """(height, width) grey picture for a corner detector, never rotated."""
-    if frame.mosaic is None:
-        if frame.pixels.dtype == np.uint8:
-            return frame.pixels.astype(np.uint8, copy=False)
-        scaled: Float32Array = (frame.pixels.astype(np.float32) - frame.black) * (255.0 / (frame.white - frame.black))
-        return np.asarray(np.clip(scaled, 0, 255), np.uint8)
-    # Balanced colours, smoothed over one period, with the contrast of a developed picture.
-    gain, black = (
-        np.array(part, np.float32)[_colours(frame.mosaic, *frame.pixels.shape)]
-        for part in (frame.mosaic.gains, frame.mosaic.black)
-    )
-    smooth = cv2.GaussianBlur((frame.pixels.astype(np.float32) - black) * gain, (0, 0), 0.8)
-    white = max(float(np.quantile(smooth[::8, ::8], 0.995)), 1.0)
-    return np.asarray(255 * np.sqrt(np.clip(smooth / white, 0, 1)), np.uint8)

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from rxcli.calibrate.frames import gray_of, light_of
+from rxcli.calibrate.frames import light_of
 from rxcli.calibrate.gyroflow import load_gyroflow
 from rxcli.calibrate.lens import Board, GrayImage, Rejected, calibrate_lens, find_boards
 from rxcli.calibrate.lensfun import lens_from_database
@@ -19,13 +19,14 @@ from rxcli.calibrate.picture import write_residuals
 from rxcli.calibrate.saving import profile_to_extend, with_lens, with_mode, write_profile
 from rxcli.calibrate.shutter import ShutterCalibration, calibrate_shutter
 from rxcli.calibrate.slots import calibrate_slots
-from rxcli.cli.common import claim_outputs, force_argument, json_output, options, write_json
+from rxcli.cli.common import force_argument, json_output, options, write_json
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.errors import InputError, UsageError
 from rxcli.ingest import KNOWN_SUFFIXES, open_source
-from rxcli.outputs import CAMERA, PICTURE, Output
+from rxcli.outputs import CAMERA, PICTURE, Output, claim
 from rxcli.profiles import NAME, CameraProfile, LensModel, ReadoutMode, ScreenProfile, load_profile
 from rxcli.resources import user_dir
+from rxcli.results.undistort import grey_levels
 from rxcli.runs.batch import collect_sources
 from rxcli.types import Frame, Metadata
 
@@ -75,7 +76,7 @@ class _Results:
         """
         profile = None if self._target is None else Output("--save", self._target, CAMERA, makes_folder=True)
         drawn = None if picture is None else Output("--picture", picture, PICTURE)
-        claim_outputs([json_output(self._json_path, *json_keys), profile, drawn], read, (screen,), self._force)
+        claim([json_output(self._json_path, *json_keys), profile, drawn], read, (screen,), self._force)
 
     def write(
         self,
@@ -162,7 +163,7 @@ class _BoardReader:
             try:
                 for frame in islice(open_source(path), 0, None, self._every):
                     self.metadata = self.metadata or frame.metadata
-                    yield (f"{path}#{frame.index}" if frame.index else str(path)), gray_of(frame)
+                    yield (f"{path}#{frame.index}" if frame.index else str(path)), grey_levels(frame)
             except InputError as error:
                 self.unreadable.append(Rejected(str(path), error.message.removeprefix(f"{path}: ")))
 

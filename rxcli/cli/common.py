@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from rxcli.cli.kinds import AUTO, CAMERA, SCREEN, SHARE, Point
+from rxcli.cli.kinds import CAMERA, SCREEN, SHARE, Point
 from rxcli.errors import UsageError
 
 if TYPE_CHECKING:
     from rxcli.options import ReceiverOptions
-    from rxcli.outputs import Output, Taken
+    from rxcli.outputs import Output
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -108,29 +108,6 @@ def refuse(*rules: tuple[object, str, str]) -> None:
     for is_wrong, reason, step in rules:
         if is_wrong:
             raise UsageError(reason, step)
-
-
-def claim_outputs(
-    outputs: Iterable[Output | None],
-    inputs: Iterable[str | Path] = (),
-    profiles: Iterable[str | Path | None] = (),
-    force: bool = False,
-) -> Taken:
-    """Refuse outputs that would destroy something, before anything is opened (see `rxcli.outputs.claim`).
-
-    Args:
-        outputs: all files that the command will write; None where an option was not given.
-        inputs: files that it reads.
-        profiles: names and files of profiles that it reads.
-        force: of `force_argument`.
-
-    Raises:
-        UsageError: one of them would.
-    """
-    from rxcli.outputs import claim
-
-    named = [path for path in profiles if path is not None and path != AUTO]
-    return claim([output for output in outputs if output is not None], inputs, named, force)
 
 
 def json_output(path: str | None, *keys: str) -> Output | None:

@@ -14,16 +14,17 @@ from tempfile import NamedTemporaryFile
 from typing import Any
 
 from rxcli import __version__, outputs
-from rxcli.cli.common import claim_outputs, receiver_options, refuse
+from rxcli.cli.common import receiver_options, refuse
 from rxcli.cli.printing import JsonLines, PayloadTable, Progress, Table, Writer, print_line, print_text
 from rxcli.errors import ExitCode, InputError, ReceiverError, worst
 from rxcli.ingest import KNOWN_SUFFIXES, MAX_BYTES, open_source
 from rxcli.link.collector import PhotoCollector
 from rxcli.link.saving import save_objects
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import CameraProfile, dump_profile
+from rxcli.profiles import dump_profile
 from rxcli.results import report, summary
 from rxcli.results.baseline import load_baseline
+from rxcli.results.cameras import estimated_camera
 from rxcli.results.truth import Scorer, load_truth, truth_for
 from rxcli.runs import batch
 from rxcli.runs.journal import Head, Journal, Lines
@@ -70,23 +71,13 @@ def _with_same_camera(sources: list[batch.Source], configured: ReceiverOptions) 
     for source, results in batch.decode_here(sources, decoder):
         photo = next(iter(results))
         if photo.gives_camera:
-            profile = _estimated_camera(photo, source.path, "same-camera")
+            profile = estimated_camera(next(iter(open_source(source.path))), photo, "same-camera")
             log.info("all photos are taken as by the camera of %s", source.name)
             if profile.models:
                 return replace(configured, cameras=(profile, *configured.cameras))
             return replace(configured, cameras=(profile,), force_camera=True)
     log.warning("--same-camera: no photo gives packets in half of its columns; each camera is estimated by itself")
     return configured
-
-
-def _estimated_camera(result: FrameResult, path: str, name: str) -> CameraProfile:
-    """A profile of the camera that was estimated from a frame of the file at `path`."""
-    from rxcli.receiver.camera import camera_profile
-    from rxcli.receiver.plane.orientation import as_received
-
-    frame, _ = as_received(next(iter(open_source(path))), result)
-    about = frame.metadata
-    return camera_profile(result.estimated, name, about.make, about.model, frame.width, frame.height)
 
 
 def _check(paths: tuple[str, ...], given: dict[str, Any], n_sources: int) -> None:
@@ -117,7 +108,7 @@ def _claim(given: dict[str, Any], sources: list[batch.Source]) -> outputs.Taken:
     """Refuse outputs that would destroy something, and make the folders of the taps; returns the files of the run."""
     truths = [truth_for(source.name, given["truth"]) for source in sources]
     inputs = [source.path for source in sources] + [str(path) for path in truths if path is not None]
-    taken = claim_outputs(_outputs(given), inputs, (*given["screens"], *given["cameras"]), given["force"])
+    taken = outputs.claim(_outputs(given), inputs, (*given["screens"], *given["cameras"]), given["force"])
     out = given["out"]
     for name in ("dump_dir", "save_undistorted", "out"):
         if given[name] is not None:
@@ -307,8 +298,8 @@ class _Run:
             log.error("%s was not written: no packet was received with an estimated camera", path)
             return
         name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.stem).lstrip("._-") or "camera"
-        profile = _estimated_camera(self._estimated, self._paths[self._estimated.source], name)
-        outputs.write_whole(path, dump_profile(profile))
+        frame = next(iter(open_source(self._paths[self._estimated.source])))
+        outputs.write_whole(path, dump_profile(estimated_camera(frame, self._estimated, name)))
 
     def _conclude(self) -> list[ExitCode]:
         """Write what is written at the end, each whether or not the others can be; returns why some could not.

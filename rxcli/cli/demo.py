@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from rxcli.cli.common import claim_outputs, force_argument, options
+from rxcli.cli.common import force_argument, options
 from rxcli.cli.kinds import FOLDER
 from rxcli.errors import ExitCode, UsageError
 
@@ -30,12 +30,12 @@ def demo(text: str, out: Path, open_page: bool, force: bool) -> int:
     """
     from rxcli.cli.inspect import page_output, write_page
     from rxcli.options import receiver_options
-    from rxcli.outputs import ANYTHING, NEVER, OUTPUT_MARKER, Output, claim_own_folder, write_whole
+    from rxcli.outputs import ANYTHING, NEVER, OUTPUT_MARKER, Output, claim, claim_own_folder, write_whole
     from rxcli.results.report import format_received
 
     photo = out / "photo.jpg"
     ours = ANYTHING if (out / OUTPUT_MARKER).exists() else NEVER
-    claim_outputs([page_output(out), Output("--out", photo, ours, makes_folder=True)], force=force)
+    claim([page_output(out), Output("--out", photo, ours, makes_folder=True)], force=force)
     picture = _photo_of(text)
     claim_own_folder("--out", out, force=force)
     write_whole(photo, picture)

@@ -14,7 +14,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.cli.common import claim_outputs, force_argument, options, refuse
+from rxcli.cli.common import force_argument, options, refuse
 from rxcli.cli.kinds import FILE
 from rxcli.cli.sending import LIGHT, raw_sending, sending_of
 from rxcli.errors import InputError, UsageError
@@ -28,7 +28,7 @@ from rxcli.link.encoder import (
     visible_bits_of_burst,
 )
 from rxcli.link.slots import WITHOUT_TEXT, WRITERS, bytes_per_row, order_of, write_slots
-from rxcli.outputs import ENCODED, TRUTH, Output, write_whole
+from rxcli.outputs import ENCODED, TRUTH, Output, claim, write_whole
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import payload_bits
 from rxcli.results.report import plural
@@ -81,7 +81,7 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
     readme = Output("--slots", _readme_of(out), ENCODED) if has_slots and suffix in WITHOUT_TEXT else None
     written = [None if is_stream else Output("--out", out, ENCODED), readme]
     written += [Output("--truth", options["truth"], TRUTH)] if options["truth"] else []
-    claim_outputs(written, filter(None, files), (options["screen"],), options["force"])
+    claim(written, filter(None, files), (options["screen"],), options["force"])
     plan = _plan(path, screen, options)
     for row in plan.weights:
         plan.sending.check(row, screen.payload_symbols)
@@ -189,9 +189,6 @@ class _Plan:
             bursts = np.arange(start, min(start + _CHUNK, self.n_bursts))
             yield start, self.sending.labels(bursts, self.screen.columns, self.screen.payload_symbols)
 
-    def _weights_of(self, start: int, n: int) -> NDArray[np.int64]:
-        return self.weights if len(self.weights) == 1 else self.weights[start : start + n]
-
     def write_labels(self, out: Path) -> None:
         """Write labels as an array."""
         shape = (self.n_bursts, self.screen.payload_symbols, self.screen.columns)
@@ -211,25 +208,24 @@ class _Plan:
 
     def slots(self) -> Iterator[NDArray[np.uint8]]:
         """(slots, columns) 0/1 of some bursts at a time."""
-        dark = np.arange(self.screen.columns) != self.only_column
-        for slots in self._slots_of_all():
-            if self.only_column is not None:
-                slots[:, dark] = 0
-            yield slots
-
-    def _slots_of_all(self) -> Iterator[NDArray[np.uint8]]:
-        columns, repeats = self.screen.columns, self.screen.repeats
+        sends = np.array(self._sends, np.uint8)
         if isinstance(self.sending, TestLight):
             lit = np.arange(self.n_bursts * self.burst_slots) % TEST_LIGHT_SLOTS < self.sending.n_lit
-            yield np.repeat(lit[:, None], columns, axis=1).astype(np.uint8)
+            yield lit[:, None] * sends
             return
         for start, labels in self._chunks():
-            packets = packet_slots_of(labels, self._weights_of(start, len(labels))).transpose(0, 2, 1)
-            yield np.tile(packets, (1, repeats, 1)).reshape(-1, columns)
+            weights = self.weights if len(self.weights) == 1 else self.weights[start : start + len(labels)]
+            packets = packet_slots_of(labels, weights).transpose(0, 2, 1)
+            yield np.tile(packets, (1, self.screen.repeats, 1)).reshape(-1, sends.size) * sends
+
+    @property
+    def _sends(self) -> list[bool]:
+        """Which columns send."""
+        return [self.only_column in (None, column) for column in range(self.screen.columns)]
 
     def truth(self) -> dict[str, Any]:
         """What is sent, as `decode --truth` reads it: bursts without frames."""
-        screen, sends = self.screen, [self.only_column in (None, column) for column in range(self.screen.columns)]
+        screen, sends = self.screen, self._sends
         refuse((len(self.weights) > 1, "--truth needs one weight per column, for all bursts", "give --weights N"))
         rows = (row for _, labels in self._chunks() for row in payload_hex(labels, self.weights))
         bits = [payload_bits(int(w), screen.payload_symbols) for w in self.weights[0]]

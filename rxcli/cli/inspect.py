@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import (
-    claim_outputs,
-    force_argument,
-    options,
-    receiver_arguments,
-    receiver_options,
-)
+from rxcli.cli.common import force_argument, options, receiver_arguments, receiver_options
 from rxcli.cli.kinds import FOLDER
 from rxcli.errors import ExitCode, InputError
 
@@ -44,12 +38,12 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
 
     Of a clip, the first frames are received, and one is shown in full.
     """
-    from rxcli.outputs import claim_own_folder
+    from rxcli.outputs import claim, claim_own_folder
     from rxcli.results.report import format_link
 
     folder = out if out is not None else Path(f"inspect-{_stem(path)}")
     page = folder / "index.html"
-    claim_outputs([page_output(folder)], (path,), (), force)
+    claim([page_output(folder)], (path,), (), force)
     if folder.exists():  # a new one is made when there is something to put into it
         claim_own_folder("--out", folder, (page.name,), force)
     results = write_page(path, page, receiver_options(options, soft_bits=True), frame, truth, force)

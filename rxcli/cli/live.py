@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import claim_outputs, force_argument, options, receiver_arguments, receiver_options
+from rxcli.cli.common import force_argument, options, receiver_arguments, receiver_options
 from rxcli.cli.kinds import FOLDER, Exposure
 from rxcli.errors import ExitCode, UsageError, printable
 
@@ -91,7 +91,7 @@ def live(device: Path, **options: Any) -> int:
 
 def _claim(device: Path, options: dict[str, Any]) -> Taken:
     """Refuse to write over what is there; returns the files of the run."""
-    from rxcli.outputs import JOURNAL, Output, claim_folder
+    from rxcli.outputs import JOURNAL, Output, claim, claim_folder
 
     if options["out"] is not None:
         claim_folder("--out", options["out"])
@@ -99,7 +99,7 @@ def _claim(device: Path, options: dict[str, Any]) -> Taken:
     if options["json_path"] not in (None, "-"):
         way_on = "name another file, or replace it with --force"
         output = Output("--json", Path(options["json_path"]), JOURNAL, way_on=way_on)
-    return claim_outputs([output], (device,), (*options["screens"], *options["cameras"]), options["force"])
+    return claim([output], (device,), (*options["screens"], *options["cameras"]), options["force"])
 
 
 def _settings(options: dict[str, Any]) -> CameraSettings:
@@ -196,24 +196,25 @@ class Status:
     def show_if_due(self, now_s: float | None = None, changed: bool = False) -> None:
         """Show the state if it is time, also where no whole frame comes."""
         now_s = time.monotonic() if now_s is None else now_s
-        if changed or now_s - self._shown_s >= (_TERMINAL_S if self._on_terminal() else _LOG_S):
+        from rxcli.cli.printing import is_terminal
+
+        if changed or now_s - self._shown_s >= (_TERMINAL_S if is_terminal(sys.stderr) else _LOG_S):
             self._shown_s = now_s
             self._show()
-
-    @staticmethod
-    def _on_terminal() -> bool:
-        return sys.stderr is not None and sys.stderr.isatty()
 
     def _show(self) -> None:
         if self.quiet:
             return
         lines = [*format_status(self.state, self.source.counts), " | ".join(map(format_file, self._files))]
-        if not self._on_terminal():
+        from rxcli.cli.printing import is_terminal
+        from rxcli.results.report import wrapped
+
+        if not is_terminal(sys.stderr):
             _say(" | ".join(filter(None, lines)))
             return
         from tqdm import tqdm
 
-        lines = fit_lines(lines, shutil.get_terminal_size().columns - 1)
+        lines = wrapped("\n".join(lines), max(shutil.get_terminal_size().columns - 1, 20)).split("\n")
         form = {"bar_format": "{desc}", "dynamic_ncols": True, "leave": True, "file": sys.stderr}
         while len(self._bars) < len(lines):
             self._bars.append(tqdm(position=len(self._bars), **form))
@@ -246,13 +247,6 @@ def format_status(state: AimState | None, counts: CameraCounts) -> list[str]:
     if state.height_share is not None:
         facts.append(f"screen fills {100 * state.height_share:.0f} % of the height")
     return [" | ".join(rates), " | ".join(facts + lost), " ".join(filter(None, (state.reason, state.advice)))]
-
-
-def fit_lines(lines: Sequence[str], width: int) -> list[str]:
-    """The lines, broken between words where they are longer than `width`, so that nothing of them is cut off."""
-    from textwrap import wrap
-
-    return [part for line in lines for part in wrap(line, max(width, 20), subsequent_indent="  ") or [""]]
 
 
 def format_file(progress: ObjectProgress) -> str:

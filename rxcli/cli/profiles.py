@@ -9,12 +9,13 @@ from typing import Any
 import click
 import msgspec
 
-from rxcli.cli.common import claim_outputs, force_argument, json_output, options, write_json
+from rxcli.cli.common import force_argument, json_output, options, write_json
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.cli.kinds import CAMERA
 from rxcli.cli.printing import print_text
 from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
 from rxcli.ingest import open_source
+from rxcli.outputs import claim
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, known_profiles, load_profile, match_camera
 from rxcli.resources import user_dir
 from rxcli.types import Frame
@@ -36,7 +37,7 @@ def profiles(context: click.Context) -> None:
 @force_argument
 def list_profiles(json_path: str | None, force: bool) -> None:
     """List the profiles that go by their names: the user's own and the shipped ones."""
-    claim_outputs([json_output(json_path, "screens", "cameras")], force=force)
+    claim([json_output(json_path, "screens", "cameras")], force=force)
     known = _known()
     if json_path is not None:
         kinds = {f"{kind}s": [entry for entry in known if entry[0].kind == kind] for kind in ("screen", "camera")}
@@ -72,7 +73,7 @@ def _listed(profile: ScreenProfile | CameraProfile, origin: str, path: Path) -> 
 @force_argument
 def show(name: str, json_path: str | None, force: bool) -> None:
     """Show the profile NAME, one that is known or a TOML file."""
-    claim_outputs([json_output(json_path, "format", "kind", "name")], profiles=(name,), force=force)
+    claim([json_output(json_path, "format", "kind", "name")], profiles=(name,), force=force)
     profile = load_profile(name)
     if json_path is not None:
         write_json(msgspec.to_builtins(profile), json_path)
@@ -103,7 +104,7 @@ def validate(names: tuple[str, ...]) -> int:
 @force_argument
 def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | None, force: bool) -> int:
     """Show which camera profile each file would get, and why."""
-    claim_outputs([json_output(json_path, "source", "camera", "reason")], paths, cameras, force)
+    claim([json_output(json_path, "source", "camera", "reason")], paths, cameras, force)
     known = [load_profile(name, CameraProfile) for name in cameras]
     known = known or [profile for profile, _, _ in known_profiles(CameraProfile)]
     records, codes = [], [ExitCode.OK]

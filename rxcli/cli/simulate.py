@@ -14,7 +14,7 @@ import click
 import numpy as np
 
 from rxcli import outputs
-from rxcli.cli.common import claim_outputs, force_argument, options
+from rxcli.cli.common import force_argument, options
 from rxcli.cli.kinds import FILE, FOLDER, Exposure
 from rxcli.cli.printing import with_progress
 from rxcli.cli.sending import payload_bytes, sending_of
@@ -120,7 +120,7 @@ def _claim(out: Path, options: dict[str, Any]) -> None:
         patterns = {name: outputs.PICTURE if name.endswith(".png") else outputs.WAVEFORMS for name in names}
         found += [outputs.Output("--waveforms", options["waveforms"] / name, ours) for name, ours in patterns.items()]
     inputs = [options["picture"], options["payload"], *filter(None, (options["file_path"], options["slots"]))]
-    claim_outputs(found, inputs, (options["screen"],), options["force"])
+    outputs.claim(found, inputs, (options["screen"],), options["force"])
 
 
 def _list(context: click.Context, wanted: bool) -> None:

@@ -82,15 +82,10 @@ def truth_path(capture: str | Path) -> Path:
     return path.with_name(path.stem + TRUTH_SUFFIX)
 
 
-def find_truth(capture: str | Path) -> Path | None:
-    """The truth file beside `capture`, None where there is none."""
-    path = truth_path(capture)
-    return path if path.is_file() else None
-
-
 def truth_for(capture: str | Path, asked: str | Path | None) -> Path | None:
     """The truth of `capture` where a file is asked for, or "auto" for the one beside it; None where there is none."""
-    return find_truth(capture) if asked == "auto" else None if asked is None else Path(asked)
+    path = truth_path(capture) if asked == "auto" else asked and Path(asked)
+    return path if path and (asked != "auto" or path.is_file()) else None
 
 
 def load_truth(path: str | Path) -> Truth:

@@ -7,14 +7,14 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError, UsageError
 from rxcli.ingest import open_source
-from rxcli.options import ReceiverOptions, check_values, is_number, receiver_options
+from rxcli.options import check_values, is_number, receiver_options
 from rxcli.receiver.receive import receive as receive_frames
 from rxcli.receiver.receive import receive_frame
 from rxcli.results.dump import Taps, read_taps, taps_writer
@@ -39,14 +39,6 @@ class Receiver:
 
     def __init__(self, **options: Any) -> None:
         self.options = receiver_options(**{"soft_bits": True, **options})
-
-    @classmethod
-    def with_options(cls, options: ReceiverOptions) -> Self:
-        """A receiver whose options are made already."""
-        check_values(("options", options, isinstance(options, ReceiverOptions), "ReceiverOptions"))
-        receiver = cls.__new__(cls)
-        receiver.options = options
-        return receiver
 
     def decode(self, picture: Picture) -> FrameResult:
         """Receive one photograph.

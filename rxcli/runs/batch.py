@@ -414,7 +414,7 @@ class _Pool:
                 raise _WorkerDiedError("was ended")
             if not hasattr(self._own, "worker"):
                 _hold_signals(signal.SIG_BLOCK)  # in this thread, and in the process until it ignores them
-                self._own.worker = start_process(_work, self._decoder, log_level())
+                self._own.worker = start_process(_work, self._decoder, logging.getLogger("rxcli").getEffectiveLevel())
                 self._processes.append(self._own.worker[0])
         worker: tuple[BaseProcess, Connection] = self._own.worker
         return worker
@@ -447,11 +447,6 @@ def _work(connection: Connection, decoder: Decoder, level: int) -> None:
             connection.send(None)
     except (EOFError, OSError):
         return
-
-
-def log_level() -> int:
-    """The level that worker processes log at."""
-    return logging.getLogger("rxcli").getEffectiveLevel()
 
 
 def use_one_thread() -> None:

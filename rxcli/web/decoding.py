@@ -25,11 +25,10 @@ from rxcli.errors import InputError, capitalised, sentence, without_commands
 from rxcli.link.collector import PhotoCollector
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile
-from rxcli.receiver.camera import camera_profile
 from rxcli.resources import data_dir
 from rxcli.results import report
 from rxcli.results.aim import split_message
-from rxcli.results.cameras import camera_of, screen_of
+from rxcli.results.cameras import camera_of, estimated_camera, screen_of
 from rxcli.results.columns import column_rows, packet_rows, text_rows
 from rxcli.results.overlay import Preview, picture_of, preview
 from rxcli.results.record import to_record
@@ -259,10 +258,8 @@ def answer_for(
 
 def _estimated_camera(result: FrameResult, frame: Frame) -> CameraProfile | None:
     """The camera as estimated from a photo that names its model and was not turned, None otherwise."""
-    about = frame.metadata
-    if result.quarter_turns or not about.model or not result.gives_camera:
-        return None
-    return camera_profile(result.estimated, "visitor", about.make, about.model, frame.width, frame.height)
+    is_known = frame.metadata.model and result.gives_camera and not result.quarter_turns
+    return estimated_camera(frame, result, "visitor") if is_known else None
 
 
 def _files(progress: Iterable[ObjectProgress]) -> list[dict[str, Any]]:

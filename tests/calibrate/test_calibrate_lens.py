@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from rxcli.calibrate.frames import gray_of
 from rxcli.calibrate.lens import Board, Sighting, calibrate_lens, find_board, find_boards, uncovered_parts
 from rxcli.cli.main import run
 from rxcli.errors import ReceiverError, UsageError
 from rxcli.profiles import CameraProfile, load_profile
+from rxcli.results.undistort import grey_levels
 from rxcli.types import Frame, Mosaic
 
 SIZE = (640, 480)
@@ -146,9 +146,9 @@ def test_grey_of_a_mosaic_balances_colours() -> None:
     pattern = np.array([[0, 1], [1, 2]], np.uint8)
     level = np.array([500, 1000, 750])[np.tile(pattern, (10, 12))]
     frame = Frame((level + 100).astype(np.uint16), "x", mosaic=Mosaic(pattern, (2.0, 1.0, 4 / 3), (100.0,) * 3, 4000.0))
-    assert np.ptp(gray_of(frame).astype(int)) <= 1
+    assert np.ptp(grey_levels(frame).astype(int)) <= 1
     deep = Frame(np.array([[0, 32768, 65535]], np.uint16), "x", white=65535.0)
-    assert gray_of(deep).tolist() == [[0, 127, 255]]
+    assert grey_levels(deep).tolist() == [[0, 128, 255]]
 
 
 def test_command(boards: list[tuple[str, Any]], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

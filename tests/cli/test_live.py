@@ -20,13 +20,14 @@ import numpy as np
 import pytest
 from fake_camera import VLC_RX, Bench, environment, needs_umockdev
 
-from rxcli.cli.live import Status, fit_lines, format_status
+from rxcli.cli.live import Status, format_status
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode
 from rxcli.ingest import open_source
 from rxcli.ingest.v4l2 import CameraCounts, LiveSource
 from rxcli.profiles import ScreenProfile, dump_profile, load_profile
 from rxcli.results.aim import Aim
+from rxcli.results.report import wrapped
 from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
 
 WIDTH, HEIGHT, N_FRAMES = 96, 64, 10
@@ -299,7 +300,7 @@ class TestStatus:
 def test_nothing_of_the_status_is_cut_off_by_a_narrow_terminal(width: int) -> None:
     reason = "no screen found: no area with stripes was found; use the electronic shutter and a short exposure"
     lines = format_status(Aim().update(FrameResult("a", 0, 0.0, "no_screen", reason), 0.0, 1000), CameraCounts())
-    fitted = fit_lines(lines, width)
+    fitted = wrapped("\n".join(lines), width).split("\n")
     assert max(map(len, fitted)) <= width
     assert " ".join(fitted).split() == " ".join(lines).split()
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from rxcli.errors import InputError
 from rxcli.protocol import bits_to_hex
-from rxcli.results.truth import Score, Scorer, Truth, find_truth, load_truth, wrong_bits
+from rxcli.results.truth import Score, Scorer, Truth, load_truth, truth_for, wrong_bits
 from rxcli.types import ColumnResult, FrameResult, PacketResult
 
 N_BITS = 40
@@ -154,9 +154,9 @@ def test_a_wrong_truth_file_is_named_with_the_reason(
 
 
 def test_truth_beside_a_capture(tmp_path: Path) -> None:
-    assert find_truth(tmp_path / "a.b.jpg") is None
+    assert truth_for(tmp_path / "a.b.jpg", "auto") is None
     (tmp_path / "a.b.truth.json").write_text(json.dumps(RAW))
-    path = find_truth(tmp_path / "a.b.jpg")
+    path = truth_for(tmp_path / "a.b.jpg", "auto")
     assert path is not None
     assert load_truth(path).payload[2][1] == "f0f0f0f0f0"
     with pytest.raises(InputError, match="No such file"):

@@ -29,7 +29,7 @@ from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.link.encoder import message
 from rxcli.options import ReceiverOptions, receiver_options
 from rxcli.profiles import ScreenProfile, load_profile
-from rxcli.results.truth import Truth, find_truth, load_truth
+from rxcli.results.truth import Truth, load_truth, truth_for
 
 #: Scenes that are drawn from one number have this many times the run's seed, and on.
 SEEDS_A_RUN = 1_000_000
@@ -217,7 +217,7 @@ def binned(scene: Scene, share: float) -> Scene:
 def draw_capture(at: Place) -> Iterator[Case]:
     """A photograph or clip without given options, with the truth beside it; point: `path`."""
     path = Path(at.point["path"])
-    truth = find_truth(path)
+    truth = truth_for(path, "auto")
     case = Case(source=(path,), options=ReceiverOptions(), about={"file": path.name})
     yield case if truth is None else replace(case, truth=load_truth(truth))
 
