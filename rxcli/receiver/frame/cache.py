@@ -12,12 +12,15 @@ import numpy as np
 
 from rxcli.receiver.frame.timer import Timer
 from rxcli.receiver.plane import (
+    RowNoise,
+    find_row_noise,
     in_blinking_colours,
     may_lag,
     read_plane,
     red_contrast,
     sample_rows,
     strips_per_column,
+    without_row_noise,
 )
 from rxcli.receiver.screen import geometry
 from rxcli.types import Float32Array, FloatArray, Frame, Lens, LightPlane, Metadata, Outlines, RowProfiles
@@ -50,7 +53,7 @@ class FrameCache:
         """The same picture, in green and blue alone if its red lags behind the slots."""
         with self.timer("geometry"):
             share = may_lag(self.plane)
-            contrast = red_contrast(self.frame, share) if share else None
+            contrast = red_contrast(self.frame, share, self._read[1]) if share else None
             frame = in_blinking_colours(self.frame, contrast)
         return self if frame is self.frame else FrameCache(frame, self.timer)
 
@@ -69,8 +72,14 @@ class FrameCache:
 
     @cached_property
     def plane(self) -> LightPlane:
-        """The plane of the frame."""
-        return read_plane(self.frame)
+        """The plane of the frame, without the noise of its rows."""
+        return self._read[0]
+
+    @cached_property
+    def _read(self) -> tuple[LightPlane, RowNoise | None]:
+        plane = read_plane(self.frame)
+        noise = find_row_noise(plane)
+        return plane if noise is None else without_row_noise(plane, noise), noise
 
     def outlines(self, corners: FloatArray, n_columns: int, lens: Lens | None) -> Outlines:
         """Outlines of the strips of a screen's columns; as many strips as its pixels allow."""

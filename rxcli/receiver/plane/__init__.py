@@ -2,9 +2,12 @@
 
 from rxcli.receiver.plane.colour import in_blinking_colours, in_one_mix, may_lag, red_contrast
 from rxcli.receiver.plane.read import read_plane, turned
+from rxcli.receiver.plane.row_noise import RowNoise, find_row_noise, without_row_noise
 from rxcli.receiver.plane.rows import sample_rows, strips_per_column, tone_to_light
 
 __all__ = [
+    "RowNoise",
+    "find_row_noise",
     "in_blinking_colours",
     "in_one_mix",
     "may_lag",
@@ -14,4 +17,5 @@ __all__ = [
     "strips_per_column",
     "tone_to_light",
     "turned",
+    "without_row_noise",
 ]

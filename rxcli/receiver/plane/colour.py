@@ -11,8 +11,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from rxcli.receiver.plane.rows import light_of
+from rxcli.receiver.plane.row_noise import RowNoise
+from rxcli.receiver.plane.rows import light_of, tone_to_light
 from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
 
 #: Cells across a picture, their width in pixels, and rows of a block, in which each is dark and lit once.
@@ -70,16 +72,18 @@ def in_one_mix(frames: Iterable[Frame]) -> Iterator[Frame]:
         yield in_blinking_colours(frame, contrast)
 
 
-def red_contrast(frame: Frame, share: float = 1.0) -> tuple[float, float] | None:
+def red_contrast(frame: Frame, share: float = 1.0, noise: RowNoise | None = None) -> tuple[float, float] | None:
     """Contrast of the slots in red relative to green, with its standard deviation.
 
     None if neither light that blinks nor light that does not is ruled out: without colours, or without slots. If this
-    share of a picture's rows shows that red blinks, the others are not read.
+    share of a picture's rows shows that red blinks, the others are not read. Noise of rows is in both colours.
     """
     if frame.mosaic is not None:
-        return _contrast(_thinned(frame, frame.mosaic))
+        return _contrast(_thinned(frame, frame.mosaic), noise)
     if frame.colours is None:
         return None
+    if noise is not None:
+        return _contrast(tone_to_light("linear" if frame.linear else "srgb", frame.colours.thinned()), noise)
     if share < 1 and frame.colours.first_rows is not None:
         of_part = _contrast(frame.colours.first_rows(share))
         if of_part is not None and of_part[0] > _PLAINLY:
@@ -87,12 +91,15 @@ def red_contrast(frame: Frame, share: float = 1.0) -> tuple[float, float] | None
     return _contrast(frame.colours.thinned())
 
 
-def _contrast(thinned: Float32Array) -> tuple[float, float] | None:
+def _contrast(thinned: NDArray[np.floating], noise: RowNoise | None = None) -> tuple[float, float] | None:
     if thinned.shape[1] < _N_CELLS or len(thinned) < 2:
         return None
     import cv2
 
     cells = cv2.resize(thinned, (_N_CELLS, len(thinned)), interpolation=cv2.INTER_AREA)
+    if noise is not None:
+        x, by_colour = (np.arange(_N_CELLS) + 0.5) / _N_CELLS - 0.5, np.asarray(cells.T, np.float32, order="C")
+        cells = np.stack([noise.removed(colour, x) for colour in by_colour]).T
     mean, step = (cells[1:] + cells[:-1]) / 2, np.diff(cells, axis=0)
     red, green = step[..., 0] / np.maximum(mean[..., 0], _DARK), step[..., 1] / np.maximum(mean[..., 1], _DARK)
     faintest, brightest = mean[..., :2].min(axis=-1), np.maximum(cells[1:], cells[:-1]).max(axis=-1)

@@ -39,7 +39,7 @@ def read_plane(frame: Frame) -> LightPlane:
     for top in range(0, height, BAND_ROWS):
         band = frame.pixels[top : top + BAND_ROWS, : n_cells * cell_px]
         sums[1:, top : top + BAND_ROWS] = cells_of(band, cell_px).T
-    return LightPlane(_run(sums), cell_px, width, frame.black, frame.white, is_linear=frame.linear)
+    return LightPlane(running_sums(sums), cell_px, width, frame.black, frame.white, is_linear=frame.linear)
 
 
 def turned(plane: LightPlane) -> LightPlane:
@@ -53,7 +53,7 @@ def turned(plane: LightPlane) -> LightPlane:
     sums = np.zeros((n + 1, len(cells)), np.float32)
     sums[1:] = cv2.resize(rows, (n, len(cells)), interpolation=cv2.INTER_AREA).T
     sums *= np.float32(cell_px / plane.cell_px)
-    return replace(plane, sums=_run(sums), cell_px=cell_px, width=n * cell_px)
+    return replace(plane, sums=running_sums(sums), cell_px=cell_px, width=n * cell_px)
 
 
 def _cell_px(width: int, period: int) -> int:
@@ -64,7 +64,7 @@ def _cell_px(width: int, period: int) -> int:
     return cell_px
 
 
-def _run(sums: Float32Array) -> Float32Array:
+def running_sums(sums: Float32Array) -> Float32Array:
     """Running sums over the first axis, in place."""
     # Much faster than numpy.cumsum, which goes down one column at a time.
     for left, here in pairwise(sums):
@@ -104,7 +104,7 @@ def _read_mosaic(frame: Frame, mosaic: Mosaic) -> LightPlane:
             sums[1:, rows] = (runs @ weights[phase] - offsets[phase] * np.float32(cell_px)).T
     if not is_complete:
         sums = np.asarray(cv2.filter2D(sums, -1, np.array([[0.25, 0.5, 0.25]], np.float32)))
-    return LightPlane(_run(sums), cell_px, width, 0.0, 1.0, is_linear=True)
+    return LightPlane(running_sums(sums), cell_px, width, 0.0, 1.0, is_linear=True)
 
 
 def _mosaic_weights(mosaic: Mosaic) -> tuple[Float32Array, Float32Array, bool]:

@@ -106,6 +106,17 @@ def light_of(plane: LightPlane, values: Float32Array, tone: str) -> Float32Array
     return _tone_table(tone).take((encoded + np.float32(0.5)).astype(np.intp), mode="clip")
 
 
+def encode(light: Float32Array) -> Float32Array:
+    """Values 0..1 of the sRGB curve whose light is given; light below 0 and above 1 is cut off."""
+    return _srgb_table().take((light * np.float32(_TONE_STEPS) + np.float32(0.5)).astype(np.intp), mode="clip")
+
+
+@lru_cache(maxsize=1)
+def _srgb_table() -> Float32Array:
+    steps = np.arange(_TONE_STEPS + 1) / _TONE_STEPS
+    return np.interp(steps, tone_to_light("srgb", steps), steps).astype(np.float32)
+
+
 @lru_cache(maxsize=4)
 def _tone_table(tone: str) -> Float32Array:
     return tone_to_light(tone, np.arange(_TONE_STEPS + 1) / _TONE_STEPS).astype(np.float32)
