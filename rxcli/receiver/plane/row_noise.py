@@ -26,7 +26,7 @@ _OCTAVES, _LEVEL_ROWS = (1, 3, 7, 15, 31), 95
 #: the picture, where it is looked for: they are never bent.
 _NOISY, _MIDDLE = 0.18, 0.1
 #: Cells that are worth one whose slots are independent of all others; part of the slots' power that columns share.
-_CELLS_A_COLUMN, _COMMON = 5.0, 0.1
+_CELLS_A_COLUMN, _COMMON = 5.0, 0.2
 #: Distance of rows whose noise has nothing in common, and correlation at it from which light is no noise.
 _DISTANCE, _WHITE = 3, 0.3
 #: Rounds of weighting; largest gain of the noise, where a tone curve raises it; least power of a cell, of the usual.
