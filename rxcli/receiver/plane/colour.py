@@ -83,7 +83,9 @@ def red_contrast(frame: Frame, share: float = 1.0, noise: RowNoise | None = None
     if frame.colours is None:
         return None
     if noise is not None:
-        return _contrast(tone_to_light("linear" if frame.linear else "srgb", frame.colours.thinned()), noise)
+        return _contrast(
+            tone_to_light("linear" if frame.linear else "srgb", frame.colours.thinned().astype(np.float64)), noise
+        )
     if share < 1 and frame.colours.first_rows is not None:
         of_part = _contrast(frame.colours.first_rows(share))
         if of_part is not None and of_part[0] > _PLAINLY:
