@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import msgspec
 
 from rxcli.lab.benchmark.trial import Trial
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.options import ReceiverOptions
+from rxcli.profiles import CameraProfile, check_profile
 from rxcli.receiver.receive import receive
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import FrameResult
@@ -46,6 +48,15 @@ def scene(mode: str, picture: str) -> Scene:
         n_frames=4 if mode == "clip" else 1,
         frame_rate_hz=30.0,
     )
+
+
+def camera_of(camera: dict[str, Any], tone: str = "auto") -> CameraProfile:
+    """The profile of the camera that a truth names."""
+    size = {"width": camera["width"], "height": camera["height"]}
+    mode = {"name": "truth", **size, "line_delay_s": camera["line_delay_s"], "exposure_s": camera["exposure_s"]}
+    lens = {key: camera[key] for key in ("camera_matrix", "dist_coeffs", "distortion_already_corrected")}
+    raw = {"format": 1, "kind": "camera", "name": "truth", "tone": tone, "modes": [mode], "lens": {**size, **lens}}
+    return check_profile(raw, CameraProfile, "truth")
 
 
 def scored(result: FrameResult, truth: Truth) -> tuple[FrameResult, Score]:

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from small_scene import camera_of
 
 from rxcli.ingest import open_source
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile
+from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.receiver.receive import receive
-from rxcli.results.truth import Scorer, Truth, load_truth, truth_path
+from rxcli.results.truth import Scorer, load_truth, truth_path
 from rxcli.types import PacketResult
 
 
@@ -29,16 +30,6 @@ class Floor:
 
 #: Of the 4K clip's starved frames, slots given, 464 to 473 packets come out: docs/video.md.
 FLOORS = (Floor("video1080_chelsea_17k3", 720, 718), Floor("video4k_rocket_34k6", 520, 450))
-
-
-def camera_of(truth: Truth) -> CameraProfile:
-    camera = truth.camera
-    assert camera is not None
-    size = {"width": camera["width"], "height": camera["height"]}
-    mode = {"name": "video", **size, "line_delay_s": camera["line_delay_s"], "exposure_s": camera["exposure_s"]}
-    lens = {key: camera[key] for key in ("camera_matrix", "dist_coeffs", "distortion_already_corrected")}
-    raw = {"format": 1, "kind": "camera", "name": camera["name"], "modes": [mode], "lens": {**size, **lens}}
-    return check_profile(raw, CameraProfile, "truth")
 
 
 @pytest.mark.parametrize(
@@ -61,7 +52,8 @@ def test_floor(shared_captures: Path, floor: Floor, capsys: pytest.CaptureFixtur
     path = shared_captures / f"{floor.name}.mp4"
     truth = load_truth(truth_path(path))
     screen = load_profile(str(truth.screen), ScreenProfile)
-    options = ReceiverOptions(screens=(screen,), cameras=(camera_of(truth),), force_camera=True)
+    assert truth.camera is not None
+    options = ReceiverOptions(screens=(screen,), cameras=(camera_of(truth.camera),), force_camera=True)
     scorer = Scorer(truth)
     results = [scorer.add(result) for result in receive(open_source(path), options)]
     score = scorer.score()

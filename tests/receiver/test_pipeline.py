@@ -9,8 +9,9 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from ingest_files import XTRANS
 from numpy.typing import NDArray
-from small_scene import reception
+from small_scene import camera_of, reception
 
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.capture import Capture, simulate_frame
@@ -53,15 +54,6 @@ def clean(seed: int = 1) -> Capture:
     return capture("paper-34k6", "xs10-still", "sky", 30.0, seed)
 
 
-def camera_of(taken: Capture) -> CameraProfile:
-    camera = taken.truth["camera"]
-    size = {"width": camera["width"], "height": camera["height"]}
-    mode = {"name": "still", **size, "line_delay_s": camera["line_delay_s"], "exposure_s": camera["exposure_s"]}
-    lens = {key: camera[key] for key in ("camera_matrix", "dist_coeffs", "distortion_already_corrected")}
-    raw = {"format": 1, "kind": "camera", "name": "truth", "tone": taken.truth["tone_curve"], "modes": [mode]}
-    return check_profile(raw | {"lens": {**size, **lens}}, CameraProfile, "truth")
-
-
 def corners_of(taken: Capture) -> FloatArray:
     """The corners on the delivered picture."""
     import cv2
@@ -75,7 +67,8 @@ def corners_of(taken: Capture) -> FloatArray:
 
 def options_for(taken: Capture, **changes: object) -> ReceiverOptions:
     screens = (load_profile(taken.truth["screen"], ScreenProfile),)
-    options = ReceiverOptions(screens=screens, cameras=(camera_of(taken),), force_camera=True)
+    camera = camera_of(taken.truth["camera"], taken.truth["tone_curve"])
+    options = ReceiverOptions(screens=screens, cameras=(camera,), force_camera=True)
     return replace(options, **{"corners": corners_of(taken), **changes})  # type: ignore[arg-type]
 
 
@@ -144,10 +137,8 @@ def test_raw_mosaic() -> None:
     scene = replace(small_scene("paper-34k6"), output="raw")
     taken = simulate_frame(scene, 4)
     sensor = scene.sensor
-    pattern = np.array([list(row) for row in ("GGRGGB", "GGBGGR", "BRGRBG", "GGBGGR", "GGRGGB", "RBGBRG")])
-    kinds = np.select([pattern == "R", pattern == "G"], [0, 1], 2).astype(np.uint8)
     level = float(sensor.black_level)
-    mosaic = Mosaic(kinds, (1 / 0.55, 1.0, 1 / 0.65), (level, level, level), float(sensor.white_level))
+    mosaic = Mosaic(XTRANS, (1 / 0.55, 1.0, 1 / 0.65), (level, level, level), float(sensor.white_level))
     frame = Frame(taken.raw, "memory", mosaic=mosaic)
     score = score_of(received(frame, options_for(taken)), taken)
     assert score.error_free >= 0.9 * score.expected
@@ -341,7 +332,7 @@ def test_what_is_not_believed_stands_in_the_result() -> None:
 def test_a_screen_too_small_says_how_much_it_needs() -> None:
     """One packet at 8.65 kHz lasts 8.09 ms: 34 % of the 24.1 ms of a whole readout."""
     taken = clean()
-    lens_free = msgspec.structs.replace(camera_of(taken), lens=None)
+    lens_free = msgspec.structs.replace(camera_of(taken.truth["camera"], taken.truth["tone_curve"]), lens=None)
     height, width = 1040, taken.pixels.shape[1]
     line_delay = 24.098e-3 / height
     mode = msgspec.structs.replace(lens_free.modes[0], height=height, line_delay_s=line_delay)

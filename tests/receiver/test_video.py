@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from rxcli import numerics
 from rxcli.errors import InputError
-from rxcli.lab.simulate.capture import Recording, prepare
+from rxcli.lab.simulate.capture import prepare
 from rxcli.lab.simulate.scenes import preset
+from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.options import SKIPS, ReceiverOptions
-from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.receiver.channel.known_picture import ColumnLight, KnownPicture, Observation
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.cache import FrameCache
@@ -29,7 +29,6 @@ from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Clock, Float32Array, Frame, FrameResult
 
 N_FRAMES = 14
-BURST_SLOTS = 210
 
 
 @dataclass(frozen=True)
@@ -39,26 +38,6 @@ class Clip:
     frames: tuple[Frame, ...]
     truth: Truth
     options: ReceiverOptions
-
-
-def camera_of(take: Recording) -> CameraProfile:
-    scene, denoised = take.scene, take.truth("clip")["camera"]
-    width, height = scene.sensor.width, scene.sensor.height
-    mode = ReadoutMode(
-        name="video",
-        width=width,
-        height=height,
-        line_delay_s=scene.sensor.line_delay_s,
-        exposure_s=scene.exposure_s,
-    )
-    rows = [tuple(float(v) for v in row) for row in denoised["camera_matrix"]]
-    lens = LensModel(
-        width=width,
-        height=height,
-        camera_matrix=(rows[0], rows[1], rows[2]),  # type: ignore[arg-type]
-        dist_coeffs=tuple(denoised["dist_coeffs"]),
-    )
-    return CameraProfile(format=1, kind="camera", name="sim", tone="bt709", modes=(mode,), lens=lens)
 
 
 def simulate(
@@ -98,9 +77,8 @@ def simulate(
     )
     truth = msgspec.json.decode(msgspec.json.encode(take.truth("clip")), type=Truth)
     corners_px = np.array(take.truth("clip")["corners_sensor_px"])
-    options = ReceiverOptions(
-        screens=(scene.screen,), cameras=(camera_of(take),), force_camera=True, corners=corners_px, cae="never"
-    )
+    camera = build_camera_profile(take.scene, take.exposure())
+    options = ReceiverOptions((scene.screen,), (camera,), force_camera=True, corners=corners_px, cae="never")
     return Clip(frames, truth, options)
 
 

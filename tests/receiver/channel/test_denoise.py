@@ -96,11 +96,6 @@ def feature(strips: np.ndarray, name: str) -> np.ndarray:
     return strips[:, :, start : start + widths(STRIP_FEATURES)[number]]
 
 
-def column_feature(columns: np.ndarray, name: str) -> np.ndarray:
-    """(B, N) a feature of columns that is one number a slot."""
-    return columns[:, sum(widths(COLUMN_FEATURES)[: COLUMN_FEATURES.index(name)])]
-
-
 def test_the_contract_names_every_feature(scene: DenoiserInput) -> None:
     strips, columns = network_inputs(scene, np.array([0, 2]))
     n_named = [sum(widths(names)) for names in (STRIP_FEATURES, COLUMN_FEATURES)]
