@@ -209,16 +209,20 @@ class BeaconSearch:
         if last >= _TRY_UP_TO:
             return
         buffers = np.stack([gathered(layout, placement.of(total)) for placement in placements])
+        alone = float(candidate.levels.sum())
+        possible = np.flatnonzero([same_bits_llr(buffer, alone) >= _MIN_SIMILARITY for buffer in buffers])
+        if possible.size == 0:
+            return
+        buffers = buffers[possible]
         known = known_bits(layout, buffers)
         bits = known.information(buffers) / layout.code.k
-        alone = float(candidate.levels.sum())
-        possible = np.array([same_bits_llr(buffer, alone) >= _MIN_SIMILARITY for buffer in buffers])
-        which = np.flatnonzero(possible & (bits >= min(last + _RETRY_GAIN, _TRY_UP_TO)))
+        which = np.flatnonzero(bits >= min(last + _RETRY_GAIN, _TRY_UP_TO))
         if which.size == 0:
             return
         candidate.tried[key] = float(bits[which].max())
         self._fruitless[len(candidate.total)] += 1
-        for place, word in zip(which.tolist(), read_words(layout, buffers[which], known=known.of(which)), strict=True):
+        words = read_words(layout, buffers[which], known=known.of(which))
+        for place, word in zip(possible[which].tolist(), words, strict=True):
             found = None if word is None else unprotect_beacon(word)
             if found is not None:
                 yield placements[place], found

@@ -71,12 +71,14 @@ class CutPhotos:
         """Texts of a length that sums show."""
         layout = next(layout for layout in self._layouts if layout.length == length)
         for start in range(0, len(sums), _BATCH):
-            part = sums[start : start + _BATCH]
-            buffers = np.stack([gathered(layout, s.total[None]) for s in part])
+            gathering = ((gathered(layout, s.total[None]), s) for s in sums[start : start + _BATCH])
             # Bits that are sent twice agree.
-            agree = np.array([same_bits_llr(b, s.level) >= _MIN_SIMILARITY for b, s in zip(buffers, part, strict=True)])
+            agreeing = [(b, s) for b, s in gathering if same_bits_llr(b, s.level) >= _MIN_SIMILARITY]
+            if not agreeing:
+                continue
+            buffers, part = np.stack([b for b, _ in agreeing]), [s for _, s in agreeing]
             known = known_bits(layout, buffers)
-            which = np.flatnonzero(agree & (known.information(buffers) > _TRY_FROM * layout.code.k))
+            which = np.flatnonzero(known.information(buffers) > _TRY_FROM * layout.code.k)
             words = read_words(layout, buffers[which], known=known.of(which)) if which.size else []
             for place, word in zip(which.tolist(), words, strict=True):
                 found = None if word is None else unprotect_beacon(word)
