@@ -194,6 +194,8 @@ class RowProfiles:
     #: The variance of a pixel of light x is noise_floor + noise_slope * x.
     noise_floor: float
     noise_slope: float
+    #: (C, S, R) float32: light of a half-lit row; None where the picture is unknown.
+    level: Float32Array | None = None
 
     def variance(self) -> Float32Array:
         """(C, S, R) variance of `light` by the noise model."""
@@ -209,6 +211,7 @@ class RowProfiles:
             inside=self.inside[columns],
             sensor_row=None if rows is None else rows[columns],
             count=self.count[columns],
+            level=None if self.level is None else self.level[columns],
         )
 
 
@@ -273,10 +276,13 @@ class SlotSamples:
     #: (C, S, N * Q) float32: 1 where the sample lies on the screen, else 0.
     valid: Float32Array
     samples_per_slot: int
+    #: (C, S, N * Q) float32: light of a half-lit row; None where the picture is unknown.
+    level: Float32Array | None = None
 
     def of_columns(self, columns: IntArray) -> Self:
         """The samples of some columns."""
-        return replace(self, light=self.light[columns], valid=self.valid[columns])
+        level = None if self.level is None else self.level[columns]
+        return replace(self, light=self.light[columns], valid=self.valid[columns], level=level)
 
 
 @dataclass(frozen=True, slots=True)

@@ -120,11 +120,11 @@ def initial_pass(acquisition: Acquisition) -> Reception:
     model = _light_model(acquisition, clock, samples)
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
     metrics = channel.initial_metrics(*contrast, model.exposure)
-    clock = _in_bursts(acquisition, clock, metrics)
+    clock = in_bursts(acquisition, clock, metrics)
     lit = clock.on_grid(detected(metrics, clock, weight_margin=0.0).lit)
     columns = np.arange(samples.light.shape[0])
     likelihoods = channel.slot_likelihoods(samples, clock, model, lit, columns, is_initial=True)
-    clock = _in_bursts(acquisition, clock, likelihoods.metrics)
+    clock = in_bursts(acquisition, clock, likelihoods.metrics)
     clock = sync.corrected(clock, likelihoods.timing)
     posteriors = detected(likelihoods.metrics, clock)
     joint = np.zeros(columns.size, bool)
@@ -155,7 +155,7 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
     lit = single.on_grid(alone.lit)
     metrics = channel.metrics_of(llr_of(lit), 1)
-    clock = _in_bursts(acquisition, clock, metrics)
+    clock = in_bursts(acquisition, clock, metrics)
     bursts = of_bursts(clock, lit)
     posteriors = survivors.detect(bursts, QUICK_SURVIVORS)
     free = survivors.free_log_evidence(bursts, QUICK_SURVIVORS)
@@ -169,6 +169,41 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     free = posteriors.log_evidence - llr
     joint = np.ones(len(columns), bool)
     return Reception(clock, samples, contrast, posteriors, snr, model, metrics, joint, free)
+
+
+def detect_jointly(
+    acquisition: Acquisition, model: channel.ObservationModel, lit: Float32Array | None
+) -> tuple[BurstPosteriors, Float32Array]:
+    """Detect slots and picture of all columns, the copies as the clock assigns them.
+
+    Args:
+        acquisition: the clock, and profiles with a level where the picture is known.
+        model: of samples on the coarse grid.
+        lit: (C, N) probability that each slot is lit, for the light of neighbours; None: unknown.
+
+    Returns:
+        The posteriors, and (C, N) squared contrast over variance.
+    """
+    clock, columns = acquisition.clock, np.arange(len(acquisition.profiles.light))
+    samples = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
+    bursts = ratios.burst_samples(samples, clock, model.black_level, model.noise, model.crosstalk, columns, lit)
+    found = survivors.detect(bursts, QUICK_SURVIVORS if lit is None else survivor_settings)
+    return found, _joint_snr(model.over_black(samples), samples, model, clock)
+
+
+def lateness(acquisition: Acquisition, model: channel.ObservationModel, step: float) -> float:
+    """Lateness of the clock, slots, at most `step`, by the evidence of every copy by itself on a clock to each side."""
+    clock, columns = acquisition.clock.by_copy, np.arange(len(acquisition.profiles.light))
+    parts = []
+    for late in (-step, 0.0, step):
+        moved = replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
+        samples = sync.sample_slots(acquisition.profiles, ratios.by_start(moved), STILL.coarse_samples)
+        parts.append(ratios.burst_samples(samples, moved, model.black_level, model.noise, model.crosstalk, columns))
+    by_lane = survivors.lane_log_evidence(survivors.side_by_side(parts), QUICK_SURVIVORS)
+    early, here, late = by_lane.reshape(len(parts), -1).sum(axis=1).tolist()
+    bend = early + late - 2 * here
+    best = (early - late) / (2 * bend) if bend < 0 else np.sign(late - early)
+    return step * float(np.clip(best, -1, 1))
 
 
 def _joint_snr(
@@ -385,7 +420,7 @@ def _denoiser() -> Denoiser:
     return denoise.load_denoiser()
 
 
-def _in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> Clock:
+def in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> Clock:
     """Assign copies to bursts by their similarity, from metrics (C, N + memory, patterns)."""
     return sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)[0][0]
 

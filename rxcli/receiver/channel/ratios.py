@@ -43,7 +43,9 @@ def burst_samples(
     q = samples.samples_per_slot
     above = (samples.light - np.float32(black_level)) * samples.valid
     around = SLOTS_PER_SYMBOL * q
-    mean = box_sums(above, around) / np.maximum(box_sums(samples.valid, around), 1)
+    mean = samples.level
+    if mean is None:
+        mean = np.asarray(box_sums(above, around) / np.maximum(box_sums(samples.valid, around), 1), np.float32)
     mean = np.maximum(mean, np.float32(SETTINGS.min_level_sigmas * noise.sigma))
     light = np.asarray(above / mean, np.float32)
     ahead = np.diff(clock.delay_slots) * q if clock.delay_slots.any() else None

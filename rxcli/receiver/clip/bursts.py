@@ -15,6 +15,7 @@ from rxcli.receiver.clip.views import View
 from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.frame.settings import SETTINGS as pass_settings
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, slot_llr
+from rxcli.receiver.still import llr_of
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, IntArray
 
 
@@ -87,11 +88,15 @@ def bursts_of(view: View) -> list[Burst]:
     assert view.numbers is not None
     own = view.bursts
     metrics, shows_payload = channel.by_burst(own.metrics, own.clock), own.shown[..., PREAMBLE_SLOTS:].any(axis=(1, 2))
+    is_joint = view.joint is not None and np.array_equal(view.joint[0], own.clock.burst)
     bursts = []
     for index, number in enumerate(view.numbers.tolist()):
         which = own.clock.burst == index
-        copies = own.first_copy + np.flatnonzero(which & shows_payload)
-        bursts.append(Burst(number, metrics[index], own.shown[which].sum(axis=0), (own.frame,), copies, own.tracked))
+        copies, n_observed = own.first_copy + np.flatnonzero(which & shows_payload), own.shown[which].sum(axis=0)
+        evidence = metrics[index]
+        if is_joint and view.joint is not None:
+            evidence = channel.metrics_of(llr_of(view.joint[1][index]) * (n_observed > 0), view.isi_memory)
+        bursts.append(Burst(number, evidence, n_observed, (own.frame,), copies, own.tracked))
     return bursts
 
 

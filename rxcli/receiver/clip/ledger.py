@@ -15,7 +15,6 @@ from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.timeline import Timeline
 from rxcli.receiver.clip.views import View, Waiting
-from rxcli.receiver.sync import tracking
 from rxcli.types import Frame, FrameResult, OnTaps
 
 _SLOW_MOTION = "slow motion: time stamps are {:g} times as long as the link's time, which was taken"
@@ -59,10 +58,10 @@ class Ledger:
         self._n_held = self._n_first
 
     @property
-    def time(self) -> tracking.LinkTime:
-        """The link's time, once a frame was received."""
+    def timeline(self) -> Timeline:
+        """The link's time and bursts, once a frame was received."""
         assert self._timeline is not None
-        return self._timeline.time
+        return self._timeline
 
     @property
     def message(self) -> str | None:

@@ -15,21 +15,21 @@ import numpy as np
 
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
-from rxcli.receiver import channel
 from rxcli.receiver.clip.acquiring import FirstFrames
 from rxcli.receiver.clip.camera import Acquired, ClipCamera, Located
 from rxcli.receiver.clip.common_clock import common_clock
 from rxcli.receiver.clip.ledger import Ledger
-from rxcli.receiver.clip.scene import TrackedScreen
+from rxcli.receiver.clip.scene import TrackedScreen, by_copy_metrics
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.passes import Reception, shows_steady_light
 from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.light import slot_llr
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.refusal import STEADY_LIGHT
-from rxcli.receiver.still import apply_autoencoder, decode, llr_of
+from rxcli.receiver.still import apply_autoencoder, decode
 from rxcli.receiver.sync import tracking
 from rxcli.types import FloatArray, Frame, FrameResult, OnTaps
 
@@ -161,7 +161,7 @@ def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | 
         return state, ledger.add(waiting)
     view: View | Failure | None = None
     if isinstance(state, Tracking) and state.known.camera.fits(frame):
-        view = state.scene.view(cache, ledger.time)
+        view = state.scene.view(cache, ledger.timeline)
     if isinstance(state, Tracking) and view is not None:
         waiting.update(skipped={"tracking": 1})
         state = replace(state, known=replace(state.known, corners=state.scene.corners))
@@ -249,11 +249,12 @@ def _receive_anew(
         acquired.context,
         acquisition,
         _bursts_of(frame, reception),
-        reception.model.exposure.isi_memory,
+        1 if reception.is_long else reception.model.exposure.isi_memory,
         frame.height,
         reception.snr,
         denoised,
         framing=framing_of(acquisition, acquired.initial, acquired.screens),
+        joint=(reception.clock.burst, reception.posteriors.lit) if reception.is_long else None,
     )
     if not _can_track(acquired, options):
         return Lost(known), view, report
@@ -279,6 +280,5 @@ def _bursts_of(frame: Frame, reception: Reception) -> tracking.FrameBursts:
     shown = np.minimum(assemble.slots_observed(reception.samples, reception.clock.by_copy), 1)
     metrics = reception.metrics
     if reception.is_long:
-        lit = reception.clock.on_grid(reception.posteriors.lit)
-        metrics = channel.metrics_of(llr_of(lit), reception.model.exposure.isi_memory)
+        metrics = by_copy_metrics(np.asarray(0.5 + 0.5 * np.tanh(slot_llr(metrics) / 2), np.float32))
     return tracking.FrameBursts(frame.index, 0, reception.clock, metrics, shown)

@@ -10,19 +10,21 @@ import numpy as np
 
 from rxcli.numerics import TINY
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver import plane
+from rxcli.receiver import channel, plane
 from rxcli.receiver.channel import ObservationModel, SlotLikelihoods, known_picture
 from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
 from rxcli.receiver.clip.settings import SETTINGS
+from rxcli.receiver.clip.timeline import Timeline
 from rxcli.receiver.clip.views import Pose, View
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
-from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MIN_VARIANCE, Crosstalk, NoiseModel, SlotLight
+from rxcli.receiver.frame.settings import STILL
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MIN_VARIANCE, Crosstalk, Exposure, NoiseModel, SlotLight
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
-from rxcli.receiver.still import detected
+from rxcli.receiver.still import detect_jointly, in_bursts, lateness, llr_of
 from rxcli.receiver.sync import tracking
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray, Outlines
 
@@ -40,11 +42,15 @@ class TrackedScreen:
     def __init__(self, context: FrameContext, acquisition: Acquisition, model: ObservationModel, named: bool) -> None:
         frame, corners, tone = context.frame, context.sampled_corners, context.camera.tone
         self._lens, self._named, self._acquisition = context.camera.lens, named, acquisition
-        self._black_level, self._tails = model.black_level, model.tails[0]
+        self._black_level = model.black_level
         column_px = float(np.linalg.norm(corners[1] - corners[0])) / acquisition.screen.columns
         self._n_strips = min(plane.strips_per_column(column_px), SETTINGS.max_strips)
         outlines = self._outlines(frame, corners)
         strips = tracked.map_strips(outlines, frame, lambda coded: plane.tone_to_light(tone, coded))
+        noise_floor = max(acquisition.profiles.noise_floor, MIN_VARIANCE * strips.pixels)
+        #: Of a pixel.
+        self._noise = NoiseModel(noise_floor, acquisition.profiles.noise_slope)
+        self._crosstalk = Crosstalk.of(self._n_strips, acquisition.screen.light_spread, model.tails[0])
         #: Where the screen is; the picture is known on the rows where it was first.
         self.pose = self._first_pose = Pose(corners, strips, strips)
         #: The frame that was received last.
@@ -73,39 +79,43 @@ class TrackedScreen:
 
     # -- a frame -------------------------------------------------------------------------------------------------------
 
-    def view(self, cache: FrameCache, time: tracking.LinkTime) -> View | None:
+    def view(self, cache: FrameCache, timeline: Timeline) -> View | None:
         """Receive a frame by what is known; None where that does not fit.
 
         A screen at rest is searched now and then: if it had moved, the picture would fit worse.
 
         Args:
             cache: taken with the same camera as those before.
-            time: the link's time.
+            timeline: the link's time and bursts.
         """
         if self.last is None:
             return None
         self._n_unlooked += 1
         rests = self._n_rested >= SETTINGS.still_looks and self._n_updates >= SETTINGS.first_updates
         if rests and self._n_unlooked < SETTINGS.look_every:
-            view = self._view(cache, self.last, time, SETTINGS.rest_misfit)
+            view = self._view(cache, self.last, timeline, SETTINGS.rest_misfit)
             if view is not None:
                 return view
         with cache.timer("geometry"):
             is_followed = self._follow(cache.frame)
-        return self._view(cache, self.last, time, SETTINGS.misfit) if is_followed else None
+        return self._view(cache, self.last, timeline, SETTINGS.misfit) if is_followed else None
 
-    def _view(self, cache: FrameCache, last: View, time: tracking.LinkTime, max_misfit: float) -> View | None:
+    def _view(self, cache: FrameCache, last: View, timeline: Timeline, max_misfit: float) -> View | None:
         """Receive a frame with the screen at its current pose."""
         pose, frame, timer = self.pose, cache.frame, cache.timer
         with timer("sampling"):
             light, picture = self._scaled(self.strips(frame)), self._placed(pose)
             columns = picture.solve(light)
         with timer("clock"):
-            clock = self._clock(frame, columns, last.acquisition.clock, time)
+            clock = self._clock(frame, columns, last.acquisition.clock, timeline.time)
         if clock is None:
             return None
+        if clock.exposure_slots > LONG_EXPOSURE_SLOTS:
+            bursts, observed = timeline.assigned(frame, clock), _Observed(pose.rows, light, columns, 1)
+            return self._long_view(cache, observed, picture, (clock, bursts), max_misfit)
         with timer("detect"):
-            lit = _first_decision(columns, pose.rows, clock, last.isi_memory)
+            positions = known_picture.row_positions(pose.rows, clock)
+            lit = known_picture.first_decision(columns, positions, clock)
             observed = _Observed(pose.rows, light, columns, last.isi_memory)
             measured = _measured(picture, observed, clock, lit, max_misfit)
             if measured is None:
@@ -123,6 +133,72 @@ class TrackedScreen:
             pose=pose,
             flat=columns,
         )
+
+    def _long_view(
+        self,
+        cache: FrameCache,
+        observed: _Observed,
+        picture: PlacedPicture,
+        predicted: tuple[Clock, IntArray | None],
+        max_misfit: float,
+    ) -> View | None:
+        """Receive a frame whose rows show several slots: slots and what is not known of the picture, jointly.
+
+        `predicted` are its clock and, once known, the bursts of its copies.
+        """
+        assert self.last is not None
+        pose, frame, (clock, bursts) = self.pose, cache.frame, predicted
+        with cache.timer("detect"):
+            acquisition = self._acquired(observed.light, pose, picture, clock)
+            model = self._model(clock)
+            late = lateness(acquisition, model, SETTINGS.long_step)
+            clock = replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
+            single = replace(acquisition, clock=clock.by_copy)
+            found, snr = detect_jointly(single, model, None)
+            lit = single.clock.on_grid(found.lit)
+            metrics = by_copy_metrics(lit)
+            clock = in_bursts(acquisition, clock, metrics) if bursts is None else replace(clock, burst=bursts)
+            found, _ = detect_jointly(replace(acquisition, clock=clock), model, lit)
+            lit = clock.on_grid(found.lit)
+            positions = known_picture.row_positions(pose.rows, clock)
+            fit = known_picture.fit_response(observed.columns, lit, positions, clock.exposure_slots)
+            expected = known_picture.expected_light(lit, positions, clock.exposure_slots, 1, fit.response).light
+            rows_per_slot, share = clock.rows_per_slot, SETTINGS.frame_share
+            if picture.judge(observed.columns, expected, max_misfit, share, rows_per_slot) is None:
+                return None
+            shown = _shown(pose.map.inside, positions, clock)
+        view = View(
+            replace(self.last.context, cache=cache, sampled_corners=self.corners),
+            replace(self.last.acquisition, clock=clock),
+            tracking.FrameBursts(frame.index, 0, clock, metrics, shown),
+            observed.isi_memory,
+            frame.height,
+            snr,
+            light=observed.light,
+            pose=pose,
+            joint=(clock.burst, found.lit),
+        )
+        self.update(view, lambda: lit)
+        return view
+
+    def _acquired(self, light: Float32Array, pose: Pose, picture: PlacedPicture, clock: Clock) -> Acquisition:
+        """Light of the strips with the picture as far as it is known, on a clock."""
+        profiles = replace(
+            self._acquisition.profiles,
+            light=light,
+            inside=pose.map.inside,
+            rows=pose.rows.astype(np.int64),
+            count=np.full(light.shape[:2], pose.map.pixels, np.float32),
+            level=picture.picture * np.float32(0.5),
+        )
+        return replace(self._acquisition, profiles=profiles, clock=clock)
+
+    def _model(self, clock: Clock) -> ObservationModel:
+        """The light model of samples of a long exposure."""
+        rows = clock.rows_per_slot / STILL.coarse_samples
+        noise = self._noise.of_mean(self._first_pose.map.pixels * rows)
+        exposure = Exposure.of(clock.exposure_slots, STILL.coarse_samples)
+        return ObservationModel(self._black_level, noise, self._crosstalk, exposure)
 
     def _scaled(self, light: Float32Array) -> Float32Array:
         """Light (C, S, R) of the strips at the exposure of the picture; a step of it shows in all columns."""
@@ -142,7 +218,9 @@ class TrackedScreen:
             return (0.0, None) if clock is None else (_header_contrast(columns, self.rows, clock), clock)
 
         contrast, clock = with_contrast(0.0)
-        if contrast < SETTINGS.good_header:
+        # Of long exposures headers are too faint to tell a slot from the next; evidence does, see `lateness`.
+        is_known = time.is_measured and old.exposure_slots > LONG_EXPOSURE_SLOTS
+        if contrast < SETTINGS.good_header and not is_known:
             slots = np.arange(-time.sure_slots, time.sure_slots + SETTINGS.clock_step, SETTINGS.clock_step)
             best = max(map(with_contrast, slots.tolist()), key=itemgetter(0))
             if best[0] > contrast + SETTINGS.header_lead:  # A sliver of a header fits nearly as well elsewhere.
@@ -185,11 +263,13 @@ class TrackedScreen:
     # -- the picture ---------------------------------------------------------------------------------------------------
 
     def _new_picture(self) -> known_picture.KnownPicture:
-        strips, profiles = self._first_pose.map, self._acquisition.profiles
-        noise = NoiseModel(max(profiles.noise_floor, MIN_VARIANCE * strips.pixels), profiles.noise_slope)
-        crosstalk = Crosstalk.of(self._n_strips, self._acquisition.screen.light_spread, self._tails)
+        strips = self._first_pose.map
         return known_picture.KnownPicture(
-            strips.inside.shape, crosstalk, self._black_level, noise.of_mean(strips.pixels)
+            strips.inside.shape,
+            self._crosstalk,
+            self._black_level,
+            self._noise.of_mean(strips.pixels),
+            self._acquisition.clock.exposure_slots,
         )
 
     def _placed(self, pose: Pose) -> PlacedPicture:
@@ -253,6 +333,10 @@ class TrackedScreen:
         assert view.pose is not None
         pose, clock = view.pose, view.bursts.clock
         picture = self._picture.without(own).placed(pose.map.inside, pose.picture_row)
+        if view.joint is not None:
+            acquisition = self._acquired(view.light, pose, picture, clock)
+            view.joint = clock.burst, detect_jointly(acquisition, self._model(clock), known)[0].lit
+            return
         columns = picture.solve(view.light)
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:
             return
@@ -286,16 +370,9 @@ class _Observed:
     isi_memory: int
 
 
-def _first_decision(columns: ColumnLight, rows: FloatArray, clock: Clock, isi_memory: int) -> Float32Array:
-    """(C, N) probability that each slot is lit; each packet by itself where exposures show many slots at once."""
-    positions = known_picture.row_positions(rows, clock)
-    if clock.exposure_slots <= LONG_EXPOSURE_SLOTS:
-        return known_picture.first_decision(columns, positions, clock)
-    half = np.full((len(columns.value), clock.n_slots), 0.5, np.float32)
-    response = known_picture.Response()
-    expected = known_picture.expected_light(half, positions, clock.exposure_slots, isi_memory, response)
-    metrics = known_picture.slot_likelihoods(columns, expected, clock, isi_memory).metrics
-    return clock.by_copy.on_grid(detected(metrics, clock.by_copy, weight_margin=0.0).lit)
+def by_copy_metrics(lit: Float32Array) -> FloatArray:
+    """Metrics of slots (C, N) of a long exposure, of which some are wrong although each copy is sure."""
+    return channel.metrics_of(llr_of(0.5 + (1 - 2 * np.float32(SETTINGS.wrong_slots)) * (lit - 0.5)), 1)
 
 
 def _measured(

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 class ClipSettings:
     """Each with its unit and the reason for it."""
 
+    #: Share of the slots of a long exposure that are wrong where a copy is detected by itself.
+    wrong_slots: float = 0.15
     #: Maximum number of strips of a column: more do not improve a known picture, and take time.
     max_strips: int = 4
     #: Movement that is none: pixels, or standard deviations of what was found.
@@ -43,6 +45,8 @@ class ClipSettings:
     good_header: float = 0.6
     header_lead: float = 0.1
     clock_step: float = 0.5
+    #: Most slots by which the clock of a long exposure is moved in a frame.
+    long_step: float = 0.25
 
     #: First frames whose outlines are compared. First frames that are taken together: for the clock where each shows
     #: little, for the phase of the bursts and for the picture; number where these leave doubt; and share of well lit

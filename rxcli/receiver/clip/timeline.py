@@ -15,7 +15,7 @@ from rxcli.receiver.decode.settings import SETTINGS as decode_settings
 from rxcli.receiver.light import slot_llr
 from rxcli.receiver.search.framing import log_odds
 from rxcli.receiver.sync import tracking
-from rxcli.types import BoolArray, FloatArray, Frame, IntArray
+from rxcli.types import BoolArray, Clock, FloatArray, Frame, IntArray
 
 
 @dataclass(slots=True, eq=False)
@@ -95,6 +95,15 @@ class Timeline:
         view.bursts = replace(view.bursts, clock=replace(clock, burst=bursts - numbers[0]))
         view.numbers = numbers + self.offset
         self.next_number = max(self.next_number, int(view.numbers[-1]) + 1)
+
+    def assigned(self, frame: Frame, clock: Clock) -> IntArray | None:
+        """(n_copies,) bursts of the copies of a frame on its predicted clock; None where these are in doubt."""
+        slot = self.time.predict(frame.index, frame.time_s)
+        if slot is None or not self.phase.settled:
+            return None
+        first_copy = round((slot - clock.first_slot + clock.row0 / clock.rows_per_slot) / clock.packet_slots)
+        bursts = self.phase.burst_of(first_copy + np.arange(clock.n_copies))
+        return bursts - bursts[0]
 
     def certainty(self, copies: IntArray) -> float:
         """Probability that packets have this length and that some copies of it, by their numbers, are one packet."""

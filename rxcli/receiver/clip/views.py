@@ -51,6 +51,9 @@ class View:
     pose: Pose | None = None
     #: The columns' own light; None where the frame was received like a photograph.
     flat: ColumnLight | None = None
+    #: Of a long exposure, whose copies were detected together: their bursts, and (B, C, packet) probability that each
+    #: slot is lit. The metrics are then those of every copy by itself.
+    joint: tuple[IntArray, Float32Array] | None = None
     #: How sure the length of packets is by this frame alone; None where the picture was known.
     framing: Framing | None = None
     #: (B,) numbers of the frame's bursts, once known.

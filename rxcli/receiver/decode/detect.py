@@ -9,7 +9,6 @@ are fixed, and the sum over all paths is the evidence for `w`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from math import comb
@@ -35,8 +34,6 @@ from rxcli.types import BurstPosteriors, Float32Array, FloatArray
 _MIN_LIKELIHOOD = 1e-60
 #: Slots between rescalings of likelihoods.
 _SCALED_AFTER = 4
-#: States up to which a product of their transitions is quicker than one over the words.
-_FEW_STATES = 8
 
 
 def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> BurstPosteriors:
@@ -126,10 +123,7 @@ class _Branches:
     #: (words,) the word's first `memory` slots, and its last ones, as state numbers.
     prefix: NDArray[np.int64]
     suffix: NDArray[np.int64]
-    #: (words, states): 1 at the word's prefix, and at its suffix; (words, states * states): at both, of few
-    #: states.
-    begins: Float32Array
-    ends: Float32Array
+    #: (words, states * states): 1 at the word's prefix and suffix.
     transition: Float32Array
     #: Patterns of header and dimming symbol, from the first slot whose predecessors are known.
     preamble: NDArray[np.int64]
@@ -144,20 +138,15 @@ def _branches(w: int, isi_memory: int) -> _Branches:
     words, states = codebook(w), _states(isi_memory)
     n_states = len(states)
     index = _pattern_index(words, isi_memory)
-    outer = words[:, :isi_memory], words[:, -isi_memory:]
-    prefix, suffix = (_pattern_index(part, isi_memory - 1)[:, 0] for part in outer)
-    begins, ends = ((end[:, None] == np.arange(n_states)).astype(np.float32) for end in (prefix, suffix))
+    ends = words[:, :isi_memory], words[:, -isi_memory:]
+    prefix, suffix = (_pattern_index(end, isi_memory - 1)[:, 0] for end in ends)
     preamble = preamble_slots(w)
     header = np.broadcast_to(np.array(HEADER[:isi_memory]), states.shape)
     return _Branches(
         features=(index[..., None] == np.arange(2 * n_states)).reshape(len(words), -1).T.astype(np.float64, order="C"),
         prefix=prefix,
         suffix=suffix,
-        begins=begins,
-        ends=ends,
-        transition=(begins[:, :, None] * ends[:, None, : n_states if n_states <= _FEW_STATES else 0]).reshape(
-            len(words), -1
-        ),
+        transition=((prefix * n_states + suffix)[:, None] == np.arange(n_states**2)).astype(np.float32),
         preamble=_pattern_index(preamble, isi_memory),
         start=(states == preamble[-isi_memory:]).all(axis=1).astype(np.float64),
         header=_pattern_index(np.concatenate([states, header], axis=1), isi_memory),
@@ -264,44 +253,29 @@ def _trellis(
     log_scale = log_scale + known + top.sum(axis=(0, 1, -1)) + top_of_end.sum(axis=(0, 2))
     log_scale = log_scale - top[..., 0].size / len(columns) * np.log(n_words)
     boundary = boundary.reshape(*boundary.shape[:-1], n_states, n_states)
+    transitions = boundary @ (remainder @ branches.transition).reshape(boundary.shape)
     start = np.broadcast_to(branches.start, end.shape)
-    # Of few states the transitions are computed at once, and only the chain is sequential.
-    is_small = n_states <= _FEW_STATES
-    transitions = boundary @ (remainder @ branches.transition).reshape(boundary.shape) if is_small else boundary
-
-    def forward(number: int, state: FloatArray) -> FloatArray:
-        leads = np.matmul(state[..., None, :], transitions[number])[..., 0, :]
-        if is_small:
-            return np.asarray(leads)
-        return np.asarray((leads.take(branches.prefix, axis=-1) * remainder[number]) @ branches.ends)
-
-    def backward(number: int, state: FloatArray) -> FloatArray:
-        if not is_small:
-            state = (state.take(branches.suffix, axis=-1) * remainder[number]) @ branches.begins
-        return np.asarray(np.matmul(transitions[number], state[..., None])[..., 0])
-
-    before, log_total = _chain(forward, start, range(len(words)))
-    after, _ = _chain(backward, end, range(len(words))[::-1])
-    after = after[::-1]
-    last = np.log(np.maximum((before[-1] * end).sum(axis=2), _MIN_LIKELIHOOD)) + log_total
+    # One chain for both directions: symbols are sequential, so everything else is batched.
+    directions = np.concatenate([transitions, transitions[::-1].swapaxes(-2, -1)], axis=1)
+    states, log_total = _chain(directions, np.concatenate([start, end]))
+    before, after = states[:, : len(end)], states[::-1, len(end) :]
+    last = np.log(np.maximum((before[-1] * end).sum(axis=2), _MIN_LIKELIHOOD)) + log_total[: len(end)]
     return _Trellis(w, columns, log_scale + last.sum(axis=0), boundary, remainder, before, after)
 
 
-def _chain(
-    step: Callable[[int, FloatArray], FloatArray], initial: FloatArray, numbers: range
-) -> tuple[FloatArray, FloatArray]:
-    """Propagate initial states (..., S) through N symbols.
+def _chain(transitions: FloatArray, initial: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Propagate initial states (..., S) through transitions (N, ..., S, S).
 
     Returns:
         (N + 1, ..., S) states, each relative to its likeliest; and (...) the logarithm of the total scale.
     """
-    states = np.empty((len(numbers) + 1, *initial.shape))
-    tops = np.empty((len(numbers), *initial.shape[:-1], 1))
+    states = np.empty((len(transitions) + 1, *initial.shape))
+    tops = np.empty((len(transitions), *initial.shape[:-1], 1))
     states[0] = initial
-    for place, number in enumerate(numbers):
-        after = step(number, states[place])
-        np.maximum(after.max(axis=-1, keepdims=True), _MIN_LIKELIHOOD, out=tops[place])
-        np.divide(after, tops[place], out=states[place + 1])
+    for before, transition, after, top in zip(states, transitions, states[1:], tops, strict=False):
+        np.matmul(before[..., None, :], transition, out=after[..., None, :])
+        np.maximum(after.max(axis=-1, keepdims=True), _MIN_LIKELIHOOD, out=top)
+        after /= top
     return states, np.log(tops[..., 0]).sum(axis=0)
 
 

@@ -36,6 +36,7 @@ def binned_strips(profiles: RowProfiles) -> RowProfiles:
         inside=profiles.inside[:, ::2] & profiles.inside[:, 1::2],
         sensor_row=None if rows is None else (rows[:, ::2] + rows[:, 1::2]) / 2,
         count=profiles.count[:, ::2] + profiles.count[:, 1::2],
+        level=None if profiles.level is None else (profiles.level[:, ::2] + profiles.level[:, 1::2]) * np.float32(0.5),
     )
 
 
@@ -363,7 +364,10 @@ def sample_slots(
         profiles = profiles.of_columns(columns)
     row0 = clock.row0 + delays * clock.rows_per_slot if delays.any() else clock.row0
     light, valid = resample(profiles, row0, step, n)
-    return SlotSamples(light, valid, samples_per_slot)
+    level = None
+    if profiles.level is not None:
+        level, _ = resample(replace(profiles, light=profiles.level), row0, step, n)
+    return SlotSamples(light, valid, samples_per_slot, level)
 
 
 def possible_bursts(clock: Clock, llr: Float32Array, repeats: Sequence[int]) -> list[tuple[Clock, float]]:

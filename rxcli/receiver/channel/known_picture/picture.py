@@ -48,12 +48,21 @@ class KnownPicture:
         crosstalk: crosstalk of the strips.
         black_level: light of a dark slot.
         noise: noise of a strip's light.
+        exposure_slots: slots that a row shows, of which a wrong one is a share of its light.
     """
 
-    def __init__(self, shape: tuple[int, ...], crosstalk: Crosstalk, black_level: float, noise: NoiseModel) -> None:
+    def __init__(
+        self,
+        shape: tuple[int, ...],
+        crosstalk: Crosstalk,
+        black_level: float,
+        noise: NoiseModel,
+        exposure_slots: float = 1.0,
+    ) -> None:
         self._crosstalk = crosstalk.shares.astype(np.float32)
         self._black_level = np.float32(black_level)
         self._noise = noise
+        self._exposure_slots = max(exposure_slots, 1.0)
         #: (4, C, S, R) sums over the frames, see `_update_of`.
         self._sums: Float32Array = np.zeros((4, *shape), np.float32)
         #: Picture and variance of its light, and the picture where it was placed last; None after a change.
@@ -133,7 +142,7 @@ class KnownPicture:
         unknown = wide / near
         error = np.float32(SETTINGS.around_error**2) + np.float32(SETTINGS.wide_error**2) * unknown * unknown
         error *= smooth * smooth
-        error += np.float32(SETTINGS.row_error) * observed
+        error += np.float32(SETTINGS.row_error / self._exposure_slots**2) * observed
         error /= total * total
         error += np.float32(SETTINGS.min_error**2)
         return picture, self._noise.through_picture(picture, picture * picture * error, np.full(1, 0.5, np.float32))
