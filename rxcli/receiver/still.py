@@ -172,33 +172,44 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
 
 
 def detect_jointly(
-    acquisition: Acquisition, model: channel.ObservationModel, lit: Float32Array | None
+    acquisition: Acquisition, model: channel.ObservationModel, w_log_prob: FloatArray, lit: Float32Array | None
 ) -> tuple[BurstPosteriors, Float32Array]:
     """Detect slots and picture of all columns, the copies as the clock assigns them.
 
     Args:
         acquisition: the clock, and profiles with a level where the picture is known.
         model: of samples on the coarse grid.
+        w_log_prob: (C, 9) log probability of the columns' weights.
         lit: (C, N) probability that each slot is lit, for the light of neighbours; None: unknown.
 
     Returns:
         The posteriors, and (C, N) squared contrast over variance.
     """
+    samples, bursts = _joint_samples(acquisition, model, w_log_prob, lit)
+    found = survivors.detect(bursts, QUICK_SURVIVORS if lit is None else survivor_settings)
+    return found, _joint_snr(model.over_black(samples), samples, model, acquisition.clock)
+
+
+def _joint_samples(
+    acquisition: Acquisition, model: channel.ObservationModel, w_log_prob: FloatArray, lit: Float32Array | None
+) -> tuple[SlotSamples, BurstSamples]:
     clock, columns = acquisition.clock, np.arange(len(acquisition.profiles.light))
     samples = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
     bursts = ratios.burst_samples(samples, clock, model.black_level, model.noise, model.crosstalk, columns, lit)
-    found = survivors.detect(bursts, QUICK_SURVIVORS if lit is None else survivor_settings)
-    return found, _joint_snr(model.over_black(samples), samples, model, clock)
+    return samples, _with_weights(bursts, w_log_prob)
 
 
-def lateness(acquisition: Acquisition, model: channel.ObservationModel, step: float) -> float:
+def _with_weights(bursts: BurstSamples, w_log_prob: FloatArray) -> BurstSamples:
+    prior = np.maximum(w_log_prob, STILL.min_weight_log_prior) / bursts.n_bursts
+    return replace(bursts, w_log_prior=np.tile(prior, (bursts.n_bursts, 1)))
+
+
+def lateness(acquisition: Acquisition, model: channel.ObservationModel, w_log_prob: FloatArray, step: float) -> float:
     """Lateness of the clock, slots, at most `step`, by the evidence of every copy by itself on a clock to each side."""
-    clock, columns = acquisition.clock.by_copy, np.arange(len(acquisition.profiles.light))
-    parts = []
+    clock, parts = acquisition.clock.by_copy, []
     for late in (-step, 0.0, step):
         moved = replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
-        samples = sync.sample_slots(acquisition.profiles, ratios.by_start(moved), STILL.coarse_samples)
-        parts.append(ratios.burst_samples(samples, moved, model.black_level, model.noise, model.crosstalk, columns))
+        parts.append(_joint_samples(replace(acquisition, clock=moved), model, w_log_prob, None)[1])
     by_lane = survivors.lane_log_evidence(survivors.side_by_side(parts), QUICK_SURVIVORS)
     early, here, late = by_lane.reshape(len(parts), -1).sum(axis=1).tolist()
     bend = early + late - 2 * here

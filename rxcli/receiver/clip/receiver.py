@@ -21,7 +21,7 @@ from rxcli.receiver.clip.common_clock import common_clock
 from rxcli.receiver.clip.ledger import Ledger
 from rxcli.receiver.clip.scene import TrackedScreen, by_copy_metrics
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.clip.views import View, Waiting
+from rxcli.receiver.clip.views import JointSlots, View, Waiting
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.passes import Reception, shows_steady_light
@@ -254,7 +254,7 @@ def _receive_anew(
         reception.snr,
         denoised,
         framing=framing_of(acquisition, acquired.initial, acquired.screens),
-        joint=(reception.clock.burst, reception.posteriors.lit) if reception.is_long else None,
+        joint=JointSlots.of(reception.clock, reception.posteriors) if reception.is_long else None,
     )
     if not _can_track(acquired, options):
         return Lost(known), view, report

@@ -15,7 +15,7 @@ from rxcli.receiver.channel import ObservationModel, SlotLikelihoods, known_pict
 from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.timeline import Timeline
-from rxcli.receiver.clip.views import Pose, View
+from rxcli.receiver.clip.views import JointSlots, Pose, View
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
@@ -147,18 +147,19 @@ class TrackedScreen:
         `predicted` are its clock and, once known, the bursts of its copies.
         """
         assert self.last is not None
+        assert self.last.joint is not None
         pose, frame, (clock, bursts) = self.pose, cache.frame, predicted
         with cache.timer("detect"):
             acquisition = self._acquired(observed.light, pose, picture, clock)
-            model = self._model(clock)
-            late = lateness(acquisition, model, SETTINGS.long_step)
+            model, weights = self._model(clock), self.last.joint.w_log_prob
+            late = lateness(acquisition, model, weights, SETTINGS.long_step)
             clock = replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
             single = replace(acquisition, clock=clock.by_copy)
-            found, snr = detect_jointly(single, model, None)
+            found, snr = detect_jointly(single, model, weights, None)
             lit = single.clock.on_grid(found.lit)
             metrics = by_copy_metrics(lit)
             clock = in_bursts(acquisition, clock, metrics) if bursts is None else replace(clock, burst=bursts)
-            found, _ = detect_jointly(replace(acquisition, clock=clock), model, lit)
+            found, _ = detect_jointly(replace(acquisition, clock=clock), model, weights, lit)
             lit = clock.on_grid(found.lit)
             positions = known_picture.row_positions(pose.rows, clock)
             fit = known_picture.fit_response(observed.columns, lit, positions, clock.exposure_slots)
@@ -176,7 +177,7 @@ class TrackedScreen:
             snr,
             light=observed.light,
             pose=pose,
-            joint=(clock.burst, found.lit),
+            joint=JointSlots.of(clock, found),
         )
         self.update(view, lambda: lit)
         return view
@@ -335,7 +336,8 @@ class TrackedScreen:
         picture = self._picture.without(own).placed(pose.map.inside, pose.picture_row)
         if view.joint is not None:
             acquisition = self._acquired(view.light, pose, picture, clock)
-            view.joint = clock.burst, detect_jointly(acquisition, self._model(clock), known)[0].lit
+            found, _ = detect_jointly(acquisition, self._model(clock), view.joint.w_log_prob, known)
+            view.joint = JointSlots.of(clock, found)
             return
         columns = picture.solve(view.light)
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:

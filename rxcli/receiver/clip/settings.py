@@ -10,7 +10,7 @@ class ClipSettings:
     """Each with its unit and the reason for it."""
 
     #: Share of the slots of a long exposure that are wrong where a copy is detected by itself.
-    wrong_slots: float = 0.15
+    wrong_slots: float = 0.08
     #: Maximum number of strips of a column: more do not improve a known picture, and take time.
     max_strips: int = 4
     #: Movement that is none: pixels, or standard deviations of what was found.

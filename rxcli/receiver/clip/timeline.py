@@ -103,7 +103,7 @@ class Timeline:
             return None
         first_copy = round((slot - clock.first_slot + clock.row0 / clock.rows_per_slot) / clock.packet_slots)
         bursts = self.phase.burst_of(first_copy + np.arange(clock.n_copies))
-        return bursts - bursts[0]
+        return np.asarray(bursts - bursts[0], np.int64)
 
     def certainty(self, copies: IntArray) -> float:
         """Probability that packets have this length and that some copies of it, by their numbers, are one packet."""

@@ -11,7 +11,7 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.search.framing import Framing
 from rxcli.receiver.sync.tracking import FrameBursts
-from rxcli.types import Float32Array, FloatArray, FrameResult, IntArray
+from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, FrameResult, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +30,22 @@ class Pose:
     def rows(self) -> FloatArray:
         """(R,) sensor rows that are read."""
         return self.map.rows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointSlots:
+    """Slots of a long exposure, whose copies were detected together."""
+
+    #: (n_copies,) bursts of the copies.
+    burst: IntArray
+    #: (B, C, packet) probability that each slot is lit, and (C, 9) log probability of the weights.
+    lit: Float32Array
+    w_log_prob: FloatArray
+
+    @classmethod
+    def of(cls, clock: Clock, posteriors: BurstPosteriors) -> JointSlots:
+        """As detected on a clock."""
+        return cls(clock.burst, posteriors.lit, posteriors.w_log_prob)
 
 
 @dataclass(slots=True, eq=False)
@@ -51,9 +67,8 @@ class View:
     pose: Pose | None = None
     #: The columns' own light; None where the frame was received like a photograph.
     flat: ColumnLight | None = None
-    #: Of a long exposure, whose copies were detected together: their bursts, and (B, C, packet) probability that each
-    #: slot is lit. The metrics are then those of every copy by itself.
-    joint: tuple[IntArray, Float32Array] | None = None
+    #: Of a long exposure; the metrics are then those of every copy by itself.
+    joint: JointSlots | None = None
     #: How sure the length of packets is by this frame alone; None where the picture was known.
     framing: Framing | None = None
     #: (B,) numbers of the frame's bursts, once known.
