@@ -336,8 +336,8 @@ class TrackedScreen:
         picture = self._picture.without(own).placed(pose.map.inside, pose.picture_row)
         if view.joint is not None:
             acquisition = self._acquired(view.light, pose, picture, clock)
-            found, _ = detect_jointly(acquisition, self._model(clock), view.joint.w_log_prob, known)
-            view.joint = JointSlots.of(clock, found)
+            again, _ = detect_jointly(acquisition, self._model(clock), view.joint.w_log_prob, known)
+            view.joint = JointSlots.of(clock, again)
             return
         columns = picture.solve(view.light)
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:

@@ -116,10 +116,8 @@ def side_by_side(parts: Sequence[BurstSamples]) -> BurstSamples:
     }
     log_scale = np.concatenate([part.log_scale for part in parts])
     priors = [part.w_log_prior for part in parts if part.w_log_prior is not None]
-    w_log_prior = np.concatenate(priors) if priors else None
-    return replace(
-        parts[0], **joined, log_scale=log_scale, w_log_prior=w_log_prior, n_bursts=len(parts) * parts[0].n_bursts
-    )
+    joined["w_log_prior"] = np.concatenate(priors) if priors else None
+    return replace(parts[0], **joined, log_scale=log_scale, n_bursts=len(parts) * parts[0].n_bursts)
 
 
 def free_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> FloatArray:
