@@ -25,7 +25,7 @@ from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 _FINE = 32
 #: Longest exposure that a memory of one slot covers, slots; those at its ends are hardly exposed.
 _MEMORY_SLOTS = 1.3
-#: Longest ISI memory of the trellis; seven slots cover an exposure of seven.
+#: Longest ISI memory; seven slots cover an exposure of seven.
 _MAX_MEMORY = 7
 #: Exposure from which no sample shows a slot by itself, so that changes of the light over a slot are looked at; and
 #: one from which a packet's last slots reach beyond the header of the next, slots.

@@ -212,8 +212,8 @@ def lateness(acquisition: Acquisition, model: channel.ObservationModel, w_log_pr
         parts.append(_joint_samples(replace(acquisition, clock=moved), model, w_log_prob, None)[1])
     by_lane = survivors.lane_log_evidence(survivors.side_by_side(parts), QUICK_SURVIVORS)
     early, here, late = by_lane.reshape(len(parts), -1).sum(axis=1).tolist()
-    bend = early + late - 2 * here
-    best = (early - late) / (2 * bend) if bend < 0 else np.sign(late - early)
+    curvature = early + late - 2 * here
+    best = (early - late) / (2 * curvature) if curvature < 0 else np.sign(late - early)
     return step * float(np.clip(best, -1, 1))
 
 

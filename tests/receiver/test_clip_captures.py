@@ -33,7 +33,7 @@ FLOORS = (Floor("video1080_chelsea_17k3", 720, 718), Floor("video4k_rocket_34k6"
 
 
 @pytest.mark.parametrize(
-    ("name", "n_frames", "least"), [("clip_exposure4_8k65", 9, 110), ("clip_exposure6_8k65", 9, 80)]
+    ("name", "n_frames", "least"), [("clip_exposure4_8k65", 9, 120), ("clip_exposure6_8k65", 9, 100)]
 )
 def test_clips_of_long_exposures(shared_captures: Path, name: str, n_frames: int, least: int) -> None:
     """Nothing told; a burst that starts in these frames has 20 packets, and there are some seven."""
@@ -43,8 +43,8 @@ def test_clips_of_long_exposures(shared_captures: Path, name: str, n_frames: int
     packets = [packet for result in results for packet in result.packets]
     assert sum(right(packet) for packet in packets) >= least
     believed = [packet for packet in packets if packet.confidence >= 0.9]
-    doubt = sum(1 - packet.confidence for packet in believed)  # as many may be wrong, give or take a Poisson deviation
-    assert sum(not right(packet) for packet in believed) <= doubt + math.sqrt(doubt)
+    doubt = sum(1 - packet.confidence for packet in believed)  # as many may be wrong, and two deviations more
+    assert sum(not right(packet) for packet in believed) <= doubt + 2 * math.sqrt(doubt)
 
 
 @pytest.mark.parametrize("floor", FLOORS, ids=lambda floor: floor.name)

@@ -219,7 +219,7 @@ class TrackedScreen:
             return (0.0, None) if clock is None else (_header_contrast(columns, self.rows, clock), clock)
 
         contrast, clock = with_contrast(0.0)
-        # Of long exposures headers are too faint to tell a slot from the next; evidence does, see `lateness`.
+        # Of long exposures headers are too faint to place the clock; evidence does, see `lateness`.
         is_known = time.is_measured and old.exposure_slots > LONG_EXPOSURE_SLOTS
         if contrast < SETTINGS.good_header and not is_known:
             slots = np.arange(-time.sure_slots, time.sure_slots + SETTINGS.clock_step, SETTINGS.clock_step)
@@ -336,8 +336,8 @@ class TrackedScreen:
         picture = self._picture.without(own).placed(pose.map.inside, pose.picture_row)
         if view.joint is not None:
             acquisition = self._acquired(view.light, pose, picture, clock)
-            again, _ = detect_jointly(acquisition, self._model(clock), view.joint.w_log_prob, known)
-            view.joint = JointSlots.of(clock, again)
+            known_better, _ = detect_jointly(acquisition, self._model(clock), view.joint.w_log_prob, known)
+            view.joint = JointSlots.of(clock, known_better)
             return
         columns = picture.solve(view.light)
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:
@@ -373,7 +373,7 @@ class _Observed:
 
 
 def by_copy_metrics(lit: Float32Array) -> FloatArray:
-    """Metrics of slots (C, N) of a long exposure, of which some are wrong although each copy is sure."""
+    """Metrics of slots (C, N) of a long exposure: some are wrong, however sure."""
     return channel.metrics_of(llr_of(0.5 + (1 - 2 * np.float32(SETTINGS.wrong_slots)) * (lit - 0.5)), 1)
 
 

@@ -48,7 +48,7 @@ class KnownPicture:
         crosstalk: crosstalk of the strips.
         black_level: light of a dark slot.
         noise: noise of a strip's light.
-        exposure_slots: slots that a row shows, of which a wrong one is a share of its light.
+        exposure_slots: exposure in slots; a wrong slot changes a row's light by its share of them.
     """
 
     def __init__(

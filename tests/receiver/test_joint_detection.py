@@ -1,0 +1,70 @@
+"""Slots of long exposures through a rough picture that is known, and the place of their clock."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rxcli.profiles import ScreenProfile, load_profile
+from rxcli.protocol import WEIGHTS, encode_packet
+from rxcli.receiver.channel import ObservationModel
+from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, SlotLight
+from rxcli.receiver.still import detect_jointly, lateness
+from rxcli.types import Clock, Float32Array, RowProfiles
+
+COLUMNS, STRIPS, ROWS_PER_SLOT, W = 4, 4, 8.0, 4
+UNKNOWN = np.full((COLUMNS, len(WEIGHTS)), -np.log(len(WEIGHTS)))
+
+
+def rough_frame(exposure_slots: float, texture: float) -> tuple[Acquisition, ObservationModel, Float32Array]:
+    """One packet in every column, whose picture changes from row to row; and the slots that were sent."""
+    rng = np.random.default_rng(4)
+    screen = load_profile("paper-8k65", ScreenProfile)
+    n = screen.packet_slots
+    bits = rng.integers(0, 2, (COLUMNS, screen.payload_symbols * 7)).astype(np.uint8)
+    sent = np.stack([encode_packet(each, W) for each in bits]).astype(np.float32)
+    clock = Clock(
+        ROWS_PER_SLOT, exposure_slots, n, -0.5, n, 0, np.zeros(1, np.int64), np.zeros(COLUMNS), header_peak_ratio=9.0
+    )
+    rows = np.arange(int(n * ROWS_PER_SLOT))
+    exposed = SlotLight(np.pad(sent, ((0, 0), (5, 5)))).mean_over(
+        ((rows + 0.5) / ROWS_PER_SLOT + 5)[None], exposure_slots
+    )
+    picture = np.exp(rng.normal(0, texture, (COLUMNS, 1, rows.size // 4))).repeat(4, axis=2)
+    picture = (picture * rng.uniform(0.8, 1.2, (COLUMNS, STRIPS, 1))).astype(np.float32)
+    light = picture * exposed[:, None] + rng.normal(0, 0.004, picture.shape)
+    profiles = RowProfiles(
+        light=light.astype(np.float32),
+        inside=np.ones(picture.shape, bool),
+        rows=rows,
+        sensor_row=None,
+        count=np.ones((COLUMNS, STRIPS), np.float32),
+        noise_floor=1.6e-5,
+        noise_slope=0.0,
+        level=picture / 2,
+    )
+    model = ObservationModel(0.0, NoiseModel(4e-6, 0.0), Crosstalk.of(STRIPS, 0.02), Exposure.of(exposure_slots, 4))
+    return Acquisition(screen, profiles, clock, (screen,)), model, sent
+
+
+@pytest.mark.parametrize("exposure_slots", [3.0, 6.0])
+def test_a_known_picture_shows_the_slots_behind_it(exposure_slots: float) -> None:
+    acquisition, model, sent = rough_frame(exposure_slots, texture=0.4)
+    unknown = replace(acquisition, profiles=replace(acquisition.profiles, level=None))
+    wrong = [
+        np.mean((detect_jointly(each, model, UNKNOWN, None)[0].lit[0] > 0.5) != (sent > 0.5))
+        for each in (acquisition, unknown)
+    ]
+    assert wrong[0] < 0.02
+    assert wrong[1] > 0.1
+
+
+@pytest.mark.parametrize("late", [-0.2, 0.0, 0.15])
+def test_the_clock_is_placed_by_evidence(late: float) -> None:
+    acquisition, model, _ = rough_frame(4.0, texture=0.4)
+    clock = acquisition.clock
+    moved = replace(acquisition, clock=replace(clock, row0=clock.row0 + late * ROWS_PER_SLOT))
+    assert lateness(moved, model, UNKNOWN, 0.25) == pytest.approx(late, abs=0.1)
