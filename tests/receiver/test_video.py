@@ -289,9 +289,10 @@ def test_parts_of_packets_are_put_together() -> None:
     assert score.false <= 1
 
 
-def test_frames_with_nothing_new_are_passed_over_on_request() -> None:
+def test_frames_with_nothing_new_are_passed_over_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
     # Longer than frames are held where the first ones leave doubt: none is passed over before.
-    long = simulate(2, SETTINGS.frames_in_doubt + 12, repeats=14)
+    monkeypatch.setattr("rxcli.receiver.clip.ledger.SETTINGS", replace(SETTINGS, frames_in_doubt=4))
+    long = simulate(2, 14, repeats=14)
     every = list(receive(long.frames, long.options))
     thinned = list(receive(long.frames, replace(long.options, stop_when_certain=True)))
     passed = [result for result in thinned if result.skipped.get("certain_frames")]
