@@ -42,7 +42,8 @@ class Collector:
         for candidate in () if soft is None else (soft, *soft.alternatives):
             by_shape[candidate.llr.shape[2], candidate.llr.shape[1]].append(candidate)
         for shape, (likeliest, *less_likely) in by_shape.items():
-            if shape not in self._shapes:
+            # The same symbols may give a text with packets of another length.
+            if shape not in self._shapes or any(isinstance(event, Message) for event in events):
                 continue
             if shape not in self._receivers:
                 self._receivers[shape] = LinkReceiver(*shape, self._under_way)

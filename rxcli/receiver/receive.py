@@ -25,10 +25,13 @@ from rxcli.receiver.plane import in_one_mix
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.attempts import receive_either_way
+from rxcli.receiver.search.cameras import UNKNOWN, known_camera
 from rxcli.receiver.search.cut import cut_packets
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.outlines import no_screen, proposed_screens, too_small
+from rxcli.receiver.search.propose import USUAL_COLUMNS, nearest_screen
 from rxcli.receiver.search.refusal import STEADY_LIGHT
+from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Frame, FrameResult, FrameSoftBits, OnTaps
@@ -78,9 +81,11 @@ def _in_total_order(options: ReceiverOptions) -> ReceiverOptions:
 
 def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None = None) -> FrameResult:
     """Receive one frame as a photograph; see `receive`."""
-    cache = FrameCache(frame)
+    cache = FrameCache(frame).in_blinking_colours()
     with one_blas_thread():
-        received = receive_either_way(cache.in_blinking_colours(), _in_total_order(options), _receive_still)
+        received = receive_either_way(cache, _in_total_order(options), _receive_still)
+        soft = _with_cut_packets(cache, received, _in_total_order(options))
+    received = received._replace(result=replace(received.result, soft_bits=soft))
     if on_taps is not None and received.taps:
         on_taps(frame.source, frame.index, received.taps)
     claims = ", ".join(frame.metadata.not_believed) if received.result.packets else ""
@@ -122,8 +127,7 @@ def _receive_screen(
     # Search: where the columns are, what a row is in time, which screen and clock.
     found = search(cache, options, outlines=outlines)
     if isinstance(found, Failure):
-        cut = _cut_packets(found.context, options) if found.message != STEADY_LIGHT else None
-        return Received(replace(failed(nothing, found), soft_bits=cut), {})
+        return Received(failed(nothing, found), {})
     outline, context, acquisition = found.outline, found.best.context, found.best.acquisition
     camera = context.camera
     # Channel and decode, in turn: metrics of slots to symbols, and symbols to the picture.
@@ -162,8 +166,6 @@ def _receive_screen(
         skipped=reception.skipped,
         soft_bits=soft_bits(frame, reception, no_header, denoised) if options.soft_bits else None,
     )
-    if no_header.all() and not result.packets:
-        result = replace(result, soft_bits=_cut_packets(context, options) or result.soft_bits)
     if result.status == "no_signal":
         result = replace(result, message=too_small(context, acquisition.screen) or assemble.why_no_packet(columns))
     elif outline.column_offset is None:
@@ -171,12 +173,27 @@ def _receive_screen(
     return Received(result, _taps(found, reception))
 
 
-def _cut_packets(context: FrameContext | None, options: ReceiverOptions) -> FrameSoftBits | None:
-    """Soft bits of a part of a packet without header, by a camera that is known; None if there are none."""
-    if context is None or context.camera.hypothesis is not None or not options.soft_bits:
-        return None
-    likeliest, *less_likely = cut_packets(context) or (None,)
-    return likeliest and replace(likeliest, alternatives=tuple(less_likely))
+def _with_cut_packets(cache: FrameCache, received: Received, options: ReceiverOptions) -> FrameSoftBits | None:
+    """The soft bits of a result; without a believable packet, those of less than a packet come first."""
+    result, known = received.result, known_camera(cache.frame, options)
+    own, is_steady = result.soft_bits, STEADY_LIGHT in (result.message or "")
+    if not options.soft_bits or received.n_believable or is_steady or isinstance(known, Failure):
+        return own
+    if known and own and result.search[-1].evidence > SETTINGS.plain_estimate:
+        return own
+    screens = proposed_screens(cache, options)
+    if isinstance(screens, Failure):
+        return own
+    corners = screens[0][0].corners if result.corners is None else result.corners
+    cut = cut_packets(FrameContext(cache, corners, known or UNKNOWN, _of_columns(result, options)))
+    likeliest, *less_likely = (*cut, *([own] if own else ())) or (None,)
+    return None if likeliest is None else replace(likeliest, alternatives=tuple(less_likely))
+
+
+def _of_columns(result: FrameResult, options: ReceiverOptions) -> tuple[ScreenProfile, ...]:
+    """Screens with the columns of a result."""
+    n_columns = nearest_screen(options.screens, len(result.columns) or USUAL_COLUMNS).columns
+    return tuple(screen for screen in options.screens if screen.columns == n_columns)
 
 
 def _taps(found: Found, reception: Reception) -> dict[str, Any]:

@@ -19,9 +19,8 @@ from rxcli.link.receiver import LinkReceiver
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.decode.soft_bits import in_view
 from rxcli.receiver.decode.steady import is_steady
-from rxcli.receiver.frame.cache import FrameCache
-from rxcli.receiver.receive import _receive_still
-from rxcli.types import FrameSoftBits
+from rxcli.receiver.receive import receive_frame
+from rxcli.types import BELIEVABLE, FrameSoftBits
 
 COLUMNS, SYMBOLS, TEXT = 20, 11, "Platform 4: the 10:42 leaves here"
 NO = Placement()
@@ -103,9 +102,10 @@ def test_a_picture_of_less_than_a_packet_gives_its_text(start_slot: float, is_op
     scene, _ = drawn.draw(rng)
     scene = replace(scene, labels=message("hello there"), start_slot=start_slot, w=5)
     trial = simulate_trial(scene, 1)
-    known = ReceiverOptions(screens=(scene.screen,), cameras=(trial.camera,), force_camera=True, corners=trial.corners)
-    result = _receive_still(FrameCache(trial.frame), replace(known, soft_bits=True)).result
-    assert not result.packets
-    assert result.soft_bits is not None
-    assert result.soft_bits.open_start == is_open
-    assert [m.text for m in Collector([scene.screen]).add(result).messages] == ["hello there"]
+    for is_known in (True, False):
+        options = ReceiverOptions(cameras=(trial.camera,) * is_known, force_camera=is_known, corners=trial.corners)
+        result = receive_frame(trial.frame, replace(options, soft_bits=True))
+        assert not any(packet.confidence >= BELIEVABLE for packet in result.packets)
+        assert result.soft_bits is not None
+        assert result.soft_bits.open_start == is_open
+        assert [m.text for m in Collector(options.screens).add(result).messages] == ["hello there"]

@@ -27,7 +27,7 @@ def curvature_terms(x: FloatArray, rows: FloatArray, width: int, height: int) ->
 
 
 #: k1 k2 p1 p2 of a unit of bend: lenses bend back further out, k2 is about -k1.
-_UNIT: FloatArray = np.array([1.0, -1.0, 0.0, 0.0])
+UNIT_BEND: FloatArray = np.array([1.0, -1.0, 0.0, 0.0])
 
 
 def straightened(strips: ColumnStrips, level: Float32Array, curvature: FloatArray) -> Float32Array:
@@ -39,10 +39,10 @@ def likeliest_bend(strips: ColumnStrips, level: Float32Array) -> FloatArray:
     """(4,) bend, other than none, under which the levelled light (M, R) of neighbouring columns is most similar."""
     strips_per_column = level.shape[0] // strips.n_columns
     level = np.ascontiguousarray(level[::strips_per_column])
-    moved = _moved_rows(strips, strips_per_column, _UNIT)
+    moved = _moved_rows(strips, strips_per_column, UNIT_BEND)
     bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, 16)
     straight = (_moved(level, bend * moved) for bend in bends)
-    return np.asarray(bends[np.argmax([(light[:-1] * light[1:]).sum() for light in straight])] * _UNIT)
+    return np.asarray(bends[np.argmax([(light[:-1] * light[1:]).sum() for light in straight])] * UNIT_BEND)
 
 
 def _moved_rows(strips: ColumnStrips, step: int, curvature: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ import numpy as np
 from rxcli.numerics import NORMAL_MEDIAN, TINY, folded, header_correlation, local_mean, peak_offset
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
-from rxcli.receiver.camera.curvature import likeliest_bend, straightened
+from rxcli.receiver.camera.curvature import UNIT_BEND, likeliest_bend, straightened
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import ColumnStrips, columns_of, joined, levelled
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MAX_EXPOSURE_SLOTS
@@ -82,6 +82,59 @@ def propose(
     short = _distinct(clock for clock in found if not any(_is_same(clock, better) for better in smeared))
     ranked = sorted(smeared + short, key=lambda clock: -clock.score)
     return [replace(clock, number=number) for number, clock in enumerate(ranked)]
+
+
+def propose_slots(strips: ColumnStrips, *, may_bend: bool = True) -> list[CameraHypothesis]:
+    """Cameras by the line of the slots alone, for a picture of less than a packet; the length of packets stays open.
+
+    Args:
+        strips: of the picture as it is stored.
+        may_bend: whether the camera may have taken a distortion out, as it cannot from a mosaic.
+    """
+    width = stripe_rows(strips)
+    if width <= 0:
+        return []
+    coarse = joined(strips, max(1, int(width / SETTINGS.rows_per_width)))
+    level, weight = levelled(coarse.light, coarse.inside, round(SETTINGS.level_widths * width / coarse.pitch))
+    level *= weight
+    n_bends = SETTINGS.n_line_bends if may_bend else 1
+    bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, n_bends) if may_bend else np.zeros(1)
+    found = [_strongest_line(coarse, level, bend * UNIT_BEND, width) for bend in bends.tolist()]
+    best = max(range(n_bends), key=lambda number: found[number][1])
+    if found[best][1] < SETTINGS.min_slot_line:
+        return []
+    return [
+        CameraHypothesis(
+            rows_per_slot=rows,
+            packet_slots=0,
+            reversed=is_reversed,
+            curvature=bend * UNIT_BEND,
+            exposure_slots=min(exposure_of(width / rows, rows), LONG_EXPOSURE_SLOTS),
+            score=strength,
+            rows_per_slot_sd=rows * rows / (4 * level.shape[1] * coarse.pitch),
+            curvature_sd=np.abs(bend * UNIT_BEND) / 4,
+            number=number,
+        )
+        for number, place in enumerate(dict.fromkeys((best, n_bends // 2)))
+        for bend, (rows, strength) in ((bends[place], found[place]),)
+        for is_reversed in (False, True)
+    ]
+
+
+def _strongest_line(strips: ColumnStrips, level: Float32Array, bend: FloatArray, width: float) -> tuple[float, float]:
+    """Rows a slot of the strongest line of the slots on stripes of one bend, and its strength."""
+    columns = columns_of(straightened(strips, level, bend), strips.n_columns)
+    line, n_rows = _slot_line(columns), columns.shape[1]
+    low, high = _line_places(width, strips.pitch, n_rows)
+    (place,) = low + _peaks(line[low : high + 2], 1, 1) if high > low + 2 else (0.0,)
+    return (_FINE * n_rows / place * strips.pitch, float(line[round(place)])) if place > 0 else (width, 0.0)
+
+
+def _line_places(width: float, pitch: float, n_rows: int) -> tuple[int, int]:
+    """Places of the slots' line, for stripes of a half width."""
+    shortest, longest = (width / slots / pitch for slots in reversed(SETTINGS.half_width_slots))
+    shortest = max(shortest, SETTINGS.min_rows_per_slot / pitch)
+    return int(_FINE * n_rows / longest), int(_FINE * n_rows / shortest)
 
 
 def _distinct(found: Iterable[CameraHypothesis]) -> list[CameraHypothesis]:

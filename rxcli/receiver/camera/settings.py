@@ -40,6 +40,9 @@ class EstimateSettings:
     n_peaks: int = 4
     #: Maximum weight of the slots' line, log-likelihood.
     max_line: float = 30.0
+    #: Strength of the slots' line that noise reaches in one of ten pictures, ln(10 * 2000 bins); bends it is sought on.
+    min_slot_line: float = 9.9
+    n_line_bends: int = 25
     #: Clocks this close, relative, are one; and hypotheses that are proposed.
     same_clock: float = 4e-3
     n_proposed: int = 5

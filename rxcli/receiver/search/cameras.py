@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, match_camera
-from rxcli.receiver.camera import CameraHypothesis, ColumnStrips, lens_of, propose, strips_of, summary, why_not
+from rxcli.receiver.camera import (
+    CameraHypothesis,
+    ColumnStrips,
+    lens_of,
+    propose,
+    propose_slots,
+    strips_of,
+    summary,
+    why_not,
+)
 from rxcli.receiver.camera import settle as settle_hypothesis
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
@@ -16,9 +27,11 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.search.settings import SETTINGS
 from rxcli.types import FloatArray, Frame, Lens, RowProfiles
 
 DEFAULT_TONE = "srgb"
+UNKNOWN = FrameCamera(None, float("nan"), float("nan"), None, DEFAULT_TONE)
 
 
 def known_camera(frame: Frame, options: ReceiverOptions) -> FrameCamera | Failure | None:
@@ -61,9 +74,8 @@ def propose_cameras(
         options: screens.
         n_columns: number of columns of the screen.
     """
-    unknown = FrameCamera(None, float("nan"), float("nan"), None, DEFAULT_TONE)
     frame, timer = cache.frame, cache.timer
-    context = FrameContext(cache, corners, unknown, options.screens)
+    context = FrameContext(cache, corners, UNKNOWN, options.screens)
     profiles = context.sample_columns(n_columns)
     with timer("blind"):
         strips = _strips(context, profiles)
@@ -75,6 +87,28 @@ def propose_cameras(
         screen = next(s for s in screens if s.packet_slots == hypothesis.packet_slots)
         yield estimated_camera(hypothesis, screen.slot_rate_hz, frame)
     return Failure("no_signal", why_not(strips))
+
+
+def cameras_by_slots(
+    context: FrameContext, screens: Sequence[ScreenProfile]
+) -> Iterator[tuple[ScreenProfile, FrameCamera]]:
+    """Cameras by the line of the slots alone, with each screen whose exposure in slots the stripes may show.
+
+    Args:
+        context: the frame.
+        screens: that it may show.
+    """
+    frame = context.frame
+    unknown = replace(context, camera=UNKNOWN)
+    for n_columns in dict.fromkeys(screen.columns for screen in screens):
+        profiles = unknown.sample_columns(n_columns)
+        with context.timer("blind"):
+            hypotheses = propose_slots(_strips(unknown, profiles), may_bend=frame.mosaic is None)
+        for hypothesis in hypotheses:
+            camera = estimated_camera(hypothesis, screens[0].slot_rate_hz, frame)
+            own = [(s, relabelled_camera(camera, s, frame)) for s in screens if s.columns == n_columns]
+            off = [abs(np.log(c.exposure_s * s.slot_rate_hz / hypothesis.exposure_slots)) for s, c in own]
+            yield from (pair for pair, far in zip(own, off, strict=True) if far < min(off) + SETTINGS.near_exposures)
 
 
 def estimated_camera(hypothesis: CameraHypothesis, slot_rate_hz: float, frame: Frame) -> FrameCamera:

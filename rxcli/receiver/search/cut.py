@@ -1,19 +1,20 @@
-"""Packets without a header in view: soft bits for each start that the picture leaves open."""
+"""Less than a packet in view: soft bits for each camera, screen, clock and start that the picture leaves open."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
-from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.camera.settings import SETTINGS as CAMERA
+from rxcli.receiver.frame.acquisition import Acquisition, distinct_screens, noise_of
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception, dark_columns, soft_bits
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.search import evidence
+from rxcli.receiver.search.cameras import cameras_by_slots, settle
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import decode, detected_on, initial_pass
 from rxcli.receiver.sync import clock as sync
@@ -23,35 +24,114 @@ from rxcli.types import Clock, FrameSoftBits
 _SKIP = frozenset({"dark_columns"})
 
 
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    """A clock of one camera and screen."""
+
+    context: FrameContext
+    acquisition: Acquisition
+    #: Of its middle columns; less that of most clocks of the same camera and screen.
+    evidence: float
+    lead: float = 0.0
+
+    def is_near(self, better: _Candidate) -> bool:
+        """Whether its symbols begin where those of a better one do, by the same screen read the same way."""
+        if self.acquisition.screen != better.acquisition.screen or self.is_reversed != better.is_reversed:
+            return False
+        apart = (self._symbol_phase - better._symbol_phase) % SLOTS_PER_SYMBOL
+        return min(apart, SLOTS_PER_SYMBOL - apart) < SETTINGS.same_symbols_slots
+
+    @property
+    def is_reversed(self) -> bool:
+        """Whether rows run against the readout."""
+        return self.context.camera.reversed
+
+    @property
+    def _symbol_phase(self) -> float:
+        """Slots from the beginning of a symbol to the middle row."""
+        clock, (top, bottom) = self.acquisition.clock, sync.row_span(self.acquisition.profiles)
+        return ((top + bottom) / 2 - clock.row0) / clock.rows_per_slot + clock.first_slot
+
+
 def cut_packets(context: FrameContext) -> tuple[FrameSoftBits, ...]:
-    """Soft bits of a frame that shows less than a packet and no header, for its likeliest clocks.
+    """Soft bits of a frame that shows less than a packet, likeliest first.
 
     Args:
-        context: the frame with its camera and screens.
+        context: the frame with its screens; its camera, or an unknown one.
     """
-    screens = {(s.slot_rate_hz, s.packet_slots, s.columns): s for s in context.screens}.values()
     with context.timer("detect"):
-        candidates = [candidate for screen in screens for candidate in _candidates(context, screen)]
-        likeliest = sorted(candidates, key=lambda candidate: -candidate[0])[: SETTINGS.cut_clocks]
-        found = [_soft_bits(context, acquisition, initial) for _, acquisition, initial in likeliest]
-    return tuple(sorted(found, key=_certainty, reverse=True)[: SETTINGS.max_cut])
+        candidates = _distinct(c for possible in _contexts(context) for c in _candidates(possible))
+        if context.camera.profile is None:
+            # Words of weight 5 are as likely read backwards.
+            best_of_each_way = {c.is_reversed: c for c in reversed(candidates)}.values()
+            candidates = _distinct((*(c for best in best_of_each_way for c in _fitted(best)), *candidates))
+        return tuple(_soft_bits(candidate) for candidate in candidates)
 
 
-def _certainty(soft: FrameSoftBits) -> float:
-    """Expected number of right bits above chance: slots and symbols out of phase leave words in doubt."""
-    return float(np.tanh(np.abs(soft.llr) / 2).sum())
+def _contexts(context: FrameContext) -> Iterator[FrameContext]:
+    """The frame by each camera and screen that it may show."""
+    screens = distinct_screens(context.screens)
+    if context.camera.profile is not None:
+        yield from (replace(context, screens=(screen,)) for screen in screens)
+        return
+    for screen, camera in cameras_by_slots(context, screens):
+        yield replace(context, camera=camera, screens=(screen,))
 
 
-def _candidates(context: FrameContext, screen: ScreenProfile) -> Iterator[tuple[float, Acquisition, Reception]]:
-    """Evidence, clock and initial pass for every phase of slots and symbols."""
+def _distinct(candidates: Iterable[_Candidate]) -> list[_Candidate]:
+    """The likeliest few whose symbols begin at different places."""
+    out: list[_Candidate] = []
+    for candidate in sorted(candidates, key=lambda candidate: -candidate.lead):
+        if len(out) < SETTINGS.max_cut and not any(candidate.is_near(better) for better in out):
+            out.append(candidate)
+    return out
+
+
+def _fitted(best: _Candidate) -> list[_Candidate]:
+    """Candidates of the best camera, fitted to the slots that were decided with it."""
+    found: list[_Candidate] = []
+    for _ in range(CAMERA.max_fits):
+        initial = initial_pass(best.acquisition)
+        camera, moved_slots = settle(best.context, best.acquisition, initial)
+        refined = _candidates(replace(best.context, camera=camera))
+        likeliest = max(refined, key=lambda candidate: candidate.lead, default=best)
+        if likeliest.lead <= best.lead:
+            break
+        found, best = refined, likeliest
+        if moved_slots < CAMERA.matters_slots:
+            break
+    return found
+
+
+def _candidates(context: FrameContext) -> list[_Candidate]:
+    """Clocks of one camera and screen, with their lead over most of them."""
+    found = list(_clocks(context))
+    usual = float(np.median([candidate.evidence for candidate in found])) if found else 0.0
+    return [replace(candidate, lead=candidate.evidence - usual) for candidate in found]
+
+
+def _clocks(context: FrameContext) -> Iterator[_Candidate]:
+    """Clocks with a header in view, and of every phase of slots and symbols without."""
+    (screen,) = context.screens
     profiles = context.sample_columns(screen.columns)
     rows_per_slot = 1 / (screen.slot_rate_hz * context.camera.line_delay_s)
     exposure_slots = context.camera.exposure_s * screen.slot_rate_hz
     top, bottom = sync.row_span(profiles)
-    payload_slots, n_visible = screen.packet_slots - PREAMBLE_SLOTS, (bottom - top) / rows_per_slot
-    if not SETTINGS.cut_symbols * SLOTS_PER_SYMBOL < n_visible < payload_slots or exposure_slots > LONG_EXPOSURE_SLOTS:
+    n_visible = (bottom - top) / rows_per_slot
+    if n_visible < SETTINGS.cut_symbols * SLOTS_PER_SYMBOL or exposure_slots > LONG_EXPOSURE_SLOTS:
         return
-    for part in range(SETTINGS.cut_phases):
+
+    def candidate(clock: Clock) -> _Candidate:
+        acquisition = Acquisition(screen, profiles, clock, (screen,))
+        half = acquisition.of_columns(acquisition.middle_columns)
+        return _Candidate(context, acquisition, evidence.log_evidence(initial_pass(half)))
+
+    binned = sync.binned_strips(profiles)
+    clock = sync.find_clock(binned, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(binned))
+    if clock is not None and clock.header_peak_ratio > SETTINGS.min_lead:
+        yield candidate(clock)
+    payload_slots = screen.packet_slots - PREAMBLE_SLOTS
+    for part in range(SETTINGS.cut_phases if n_visible < payload_slots else 0):
         row0 = top - part / SETTINGS.cut_phases * rows_per_slot
         for phase in range(SLOTS_PER_SYMBOL):
             clock = Clock(
@@ -65,18 +145,33 @@ def _candidates(context: FrameContext, screen: ScreenProfile) -> Iterator[tuple[
                 delay_slots=np.zeros(screen.columns),
                 header_peak_ratio=0.0,
             )
-            acquisition = Acquisition(screen, profiles, clock, (screen,))
-            initial = initial_pass(acquisition)
-            yield evidence.log_evidence(initial), acquisition, initial
+            yield candidate(clock)
 
 
-def _soft_bits(context: FrameContext, acquisition: Acquisition, initial: Reception) -> FrameSoftBits:
-    """Soft bits of a cut packet, where its start is open unless its dimming symbol shows."""
-    starts = [detected_on(initial, clock) for clock in _starts(initial.clock)]
-    best = max(starts, key=evidence.log_evidence)
-    is_open = evidence.log_evidence(best) < evidence.log_evidence(initial) + SETTINGS.cut_start
-    reception = decode(acquisition, _SKIP, initial if is_open else best)
-    return replace(soft_bits(context.frame, reception, dark_columns(reception.snr)), open_start=is_open)
+def _soft_bits(candidate: _Candidate) -> FrameSoftBits:
+    """Soft bits of a cut packet, where its start is open unless header or dimming symbol show in part."""
+    acquisition, initial = max(_refined(candidate.acquisition), key=lambda found: evidence.log_evidence(found[1]))
+    best, is_open = initial, False
+    if initial.clock.header_peak_ratio == 0:
+        starts = [detected_on(initial, clock) for clock in _starts(initial.clock)]
+        likeliest = max(starts, key=evidence.log_evidence)
+        is_open = evidence.log_evidence(likeliest) < evidence.log_evidence(initial) + SETTINGS.cut_start
+        best = initial if is_open else likeliest
+    reception = decode(acquisition, _SKIP, best)
+    return replace(soft_bits(candidate.context.frame, reception, dark_columns(reception.snr)), open_start=is_open)
+
+
+def _refined(acquisition: Acquisition) -> Iterator[tuple[Acquisition, Reception]]:
+    """A clock, those a little earlier and later, and the best one corrected by its slots, with their initial passes."""
+    clock, found = acquisition.clock, list[tuple[Acquisition, Reception]]()
+    for part in (-0.5, 0.0, 0.5):
+        row0 = clock.row0 + part / SETTINGS.cut_phases * clock.rows_per_slot
+        moved = replace(acquisition, clock=replace(clock, row0=row0))
+        found.append((moved, initial_pass(moved)))
+    yield from found
+    _, best = max(found, key=lambda each: evidence.log_evidence(each[1]))
+    corrected = replace(acquisition, clock=replace(best.clock, exposure_slots=clock.exposure_slots))
+    yield corrected, initial_pass(corrected)
 
 
 def _starts(clock: Clock) -> Iterator[Clock]:

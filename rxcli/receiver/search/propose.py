@@ -23,7 +23,7 @@ from rxcli.receiver.sync import clock as sync
 from rxcli.types import Clock, RowProfiles
 
 #: Number of columns on which a clock is sought first, or the nearest available number.
-_USUAL_COLUMNS = 20
+USUAL_COLUMNS = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ class Proposer:
             yield self._of_camera(known, 0.0)
             return None
         failure, n_proposed = None, 0
-        usual = _nearest(self.options.screens, _USUAL_COLUMNS).columns
+        usual = nearest_screen(self.options.screens, USUAL_COLUMNS).columns
         for outline in self.families():
             cameras = propose_cameras(self.cache, outline.corners, self.options, usual)
             try:
@@ -83,7 +83,7 @@ class Proposer:
             screens = tuple(screen for screen in screens if screen.packet_slots == camera.hypothesis.packet_slots)
         for outline in self.families():
             for same_clock in _by_clock(outline, camera, screens).values():
-                screen = _nearest(same_clock, _USUAL_COLUMNS)
+                screen = nearest_screen(same_clock, USUAL_COLUMNS)
                 out.append(self._hypothesis(outline, camera, screen, log_prior + SETTINGS.temper * outline.log_odds))
         return out
 
@@ -136,7 +136,7 @@ class Proposer:
             same_clock = _by_clock(candidate, camera, self.options.screens).get(clock)
             if same_clock and candidate.family != outline.family:
                 change = SETTINGS.temper * (candidate.log_odds - outline.log_odds)
-                yield self._hypothesis(candidate, camera, _nearest(same_clock, n_columns), log_prior + change)
+                yield self._hypothesis(candidate, camera, nearest_screen(same_clock, n_columns), log_prior + change)
         by_clock = _by_clock(outline, camera, self.options.screens)
         by_columns = {screen.columns: screen for screen in reversed(by_clock.pop(clock, []))}
         for columns, screen in by_columns.items():
@@ -164,7 +164,7 @@ def _left(outline: Outline) -> float:
     return float(outline.corners[0] @ along / np.linalg.norm(along))
 
 
-def _nearest(screens: Iterable[ScreenProfile], n_columns: int) -> ScreenProfile:
+def nearest_screen(screens: Iterable[ScreenProfile], n_columns: int) -> ScreenProfile:
     """The screen whose number of columns is nearest."""
     return min(screens, key=lambda screen: (abs(np.log(screen.columns / n_columns)), screen.columns))
 

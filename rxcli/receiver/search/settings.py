@@ -59,13 +59,15 @@ class SearchSettings:
     #: Largest size of an outline relative to the picture, beyond which less than one column is visible.
     largest_outline: float = 50.0
 
-    #: Pictures that show no header: fewest symbols in view, phases of a slot that are tried, clocks that are decoded
-    #: and that are handed on, and log evidence by which a start with a part of the header in view must lead.
+    #: Less than a packet in view: fewest symbols, phases of a slot that are tried, clocks that are handed on, slots
+    #: within which two are one, and log evidence by which a start with a part of the header in view must lead.
     cut_symbols: int = 2
     cut_phases: int = 4
-    cut_clocks: int = 6
-    max_cut: int = 3
+    max_cut: int = 4
+    same_symbols_slots: float = 0.6
     cut_start: float = 10.0
+    #: Natural logarithm of the ratio of exposures, stated and by the stripes, beyond the nearest screen's.
+    near_exposures: float = 0.4
 
     #: Largest shift of the light of one lamp between columns, slots: blinds may be slanted.
     max_column_shift_slots: int = 10
