@@ -144,7 +144,7 @@ def _receive_screen(
             no_header,
             options.min_confidence,
             outline.certainty,
-            framing_of(acquisition, reception, found.screens).bursts,
+            framing_of(acquisition, reception, found.screens, context).bursts,
         ),
         reception.posteriors,
         reception.n_observed,

@@ -11,8 +11,9 @@ from rxcli.receiver.camera.strips import ColumnStrips, levelled
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
 NO_HEADERS = (
-    "there are stripes but no packet header where it should be; the screen may show less than one packet (move "
-    "closer), the picture may be merged from several exposures (switch HDR off), or the screen is none of those tried"
+    "there are stripes but no packet header where it should be; the screen may show less than one packet (send more "
+    "photos, film, or move closer), the picture may be merged from several exposures (switch HDR off), or the screen "
+    "is none of those tried"
 )
 
 

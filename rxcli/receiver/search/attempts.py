@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from math import log
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.frame.cache import FrameCache
@@ -103,18 +104,29 @@ def _with_estimates(cache: FrameCache, options: ReceiverOptions) -> Iterator[tup
 
 
 def _is_credible(estimated: FrameResult, frame: Frame, options: ReceiverOptions) -> bool:
-    """Whether a result with an estimated camera outweighs a profile; one with another line delay needs sure packets.
+    """Whether a result with an estimated camera outweighs what is stated; one that contradicts it needs sure packets.
 
     Under a screen that is not the one in the picture, an estimate of the camera may fit what a profile rules out.
     """
     known, line_delay_s = known_camera(frame, options), estimated.line_delay_s
-    if not isinstance(known, FrameCamera) or line_delay_s is None:
-        return True
-    if abs(line_delay_s / known.line_delay_s - 1) < _SAME_LINE_DELAY:
+    is_same = True
+    if isinstance(known, FrameCamera) and line_delay_s is not None:
+        is_same = abs(line_delay_s / known.line_delay_s - 1) < _SAME_LINE_DELAY
+    if is_same and not _is_exposure_of_another(estimated, frame, options):
         return True
     lit = [column for column in estimated.columns if column.status != "dark"]
     n_sure = sum(any(p.confidence > _SURE for p in column.packets) for column in lit)
     return 2 * n_sure > len(lit)
+
+
+def _is_exposure_of_another(estimated: FrameResult, frame: Frame, options: ReceiverOptions) -> bool:
+    """Whether the exposure that the file states lasts as many slots of another screen as the light shows."""
+    rates = {screen.name: screen.slot_rate_hz for screen in options.screens}
+    own, stated_s, found_s = rates.get(estimated.screen_profile or ""), frame.metadata.exposure_s, estimated.exposure_s
+    if not own or not stated_s or not found_s:
+        return False
+    off = {rate: abs(log(found_s * own / (stated_s * rate))) for rate in rates.values()}
+    return min(off, key=off.__getitem__) != own
 
 
 def _difference(

@@ -18,10 +18,12 @@ from rxcli.receiver import channel
 from rxcli.receiver.decode import detect
 from rxcli.receiver.decode.settings import SETTINGS as DECODE
 from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.settings import SETTINGS as PASSES
 from rxcli.receiver.light import slot_llr
 from rxcli.receiver.search import evidence
+from rxcli.receiver.search.cameras import settle
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import detected
 from rxcli.receiver.sync import clock as sync
@@ -54,13 +56,19 @@ def log_odds(probability: float) -> float:
     return float(np.log(bounded / (1 - bounded)))
 
 
-def framing_of(acquisition: Acquisition, reception: Reception, screens: Sequence[ScreenProfile]) -> Framing:
+def framing_of(
+    acquisition: Acquisition,
+    reception: Reception,
+    screens: Sequence[ScreenProfile],
+    context: FrameContext | None = None,
+) -> Framing:
     """How sure the length of packets and the copies of bursts are.
 
     Args:
         acquisition: the screen that was chosen.
         reception: its reception.
         screens: all screens that the camera may have seen.
+        context: the frame, whose stated exposure speaks for screens of one slot rate if the camera is an estimate.
     """
     own, llr = reception.clock, slot_llr(reception.metrics)
     by_copy = detect.header_llr(channel.by_burst(reception.metrics, own.by_copy))
@@ -80,7 +88,14 @@ def framing_of(acquisition: Acquisition, reception: Reception, screens: Sequence
     is_plain = all(likeliest[1] - rival[1] > PASSES.plain_bursts for rival in rivals)
     if len(lengths) == 1 and is_plain and np.array_equal(likeliest[0].burst, own.burst):
         return Framing(prior, 1.0, np.ones(int(own.burst.max()) + 1))
-    log_weight = np.array([_log_weight(reception, *framing) for each in framings.values() for framing in each])
+    exposed = _exposure_log_likelihood(context, acquisition, reception, screens)
+    log_weight = np.array(
+        [
+            _log_weight(reception, *framing) + exposed.get(length, 0.0)
+            for length, each in framings.items()
+            for framing in each
+        ]
+    )
     weight = np.exp(log_weight - log_weight.max())
     of_ways = weight[: 1 + len(rivals)] / weight.sum()
     ways = np.array([clock.burst for clock, _ in (likeliest, *rivals)])
@@ -97,6 +112,29 @@ def _framed(own: Clock, header: int, length: int) -> Clock:
     first_slot = -header % length
     n_copies = -(-(first_slot + own.n_slots) // length)
     return replace(own, packet_slots=length, first_slot=first_slot, burst=np.zeros(n_copies, np.int64))
+
+
+def _exposure_log_likelihood(
+    context: FrameContext | None, acquisition: Acquisition, reception: Reception, screens: Sequence[ScreenProfile]
+) -> dict[int, float]:
+    """Log-likelihood, by the length of packets, of the exposure in slots that the light shows, given the stated one."""
+    stated_s = None if context is None else context.frame.metadata.exposure_s
+    if context is None or not stated_s or context.camera.hypothesis is None or reception.is_long:
+        return {}
+    unstated = replace(context.camera.hypothesis, stated_exposure_slots=0.0)
+    context = replace(context, camera=replace(context.camera, hypothesis=unstated))
+    for _ in range(SETTINGS.exposure_fits):
+        camera, _ = settle(context, acquisition, reception)
+        if camera.hypothesis is None or not camera.hypothesis.exposure_slots_sd:
+            return {}
+        reception = replace(reception, clock=replace(reception.clock, exposure_slots=camera.hypothesis.exposure_slots))
+    least, found = SETTINGS.shortest_exposure, reception.clock.exposure_slots
+    out: dict[int, float] = {}
+    for screen in screens:
+        off = np.log(max(found, least) / max(stated_s * screen.slot_rate_hz, least)) / SETTINGS.exposure_sd
+        log_likelihood = max(-float(off**2) / 2, SETTINGS.min_exposure_llr)
+        out[screen.packet_slots] = max(log_likelihood, out.get(screen.packet_slots, log_likelihood))
+    return out
 
 
 def _log_weight(reception: Reception, clock: Clock, of_copies: float) -> float:

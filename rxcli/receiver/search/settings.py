@@ -69,6 +69,13 @@ class SearchSettings:
     #: Natural logarithm of the ratio of exposures, stated and by the stripes, beyond the nearest screen's.
     near_exposures: float = 0.4
 
+    #: Fits of the exposure; shortest one, slots, that the light shows; standard deviation of its logarithm; and least
+    #: log-likelihood, as files may state wrong ones.
+    exposure_fits: int = 2
+    shortest_exposure: float = 0.35
+    exposure_sd: float = 0.25
+    min_exposure_llr: float = -4.0
+
     #: Largest shift of the light of one lamp between columns, slots: blinds may be slanted.
     max_column_shift_slots: int = 10
     #: Detection of switched light without a clock: smoothing and longest period, rows; minimum explained share.

@@ -7,10 +7,16 @@ import pytest
 from row_profiles import Shot, random_link, row_profiles, sigma_of
 
 from rxcli.options import ReceiverOptions
+from rxcli.receiver.camera import CameraHypothesis
 from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.camera import FrameCamera
+from rxcli.receiver.frame.context import FrameContext
+from rxcli.receiver.search import framing
 from rxcli.receiver.search.framing import Framing, framing_of
 from rxcli.receiver.still import initial_pass
 from rxcli.receiver.sync import clock as sync
+from rxcli.types import Frame, Metadata
 
 SCREENS = tuple(screen for screen in ReceiverOptions().screens if screen.columns == 20)
 ROWS_PER_SLOT = 4.0
@@ -18,7 +24,9 @@ ROWS_PER_SLOT = 4.0
 PRIOR = 1 / (1 + 70 / 130 + 70 / 260)
 
 
-def framed(sent: str, taken_for: str, start_slot: float, n_slots: int, names: str = "") -> Framing:
+def framed(
+    sent: str, taken_for: str, start_slot: float, n_slots: int, names: str = "", context: FrameContext | None = None
+) -> Framing:
     """Receive a window of slots as of a screen; `names` begins the names of the screens that are possible."""
     rng = np.random.default_rng(1)
     screens = {screen.name: screen for screen in SCREENS}
@@ -30,16 +38,29 @@ def framed(sent: str, taken_for: str, start_slot: float, n_slots: int, names: st
     possible = tuple(screen for screen in SCREENS if screen.name.startswith(names))
     variants = tuple(screen for screen in possible if screen.packet_slots == own.packet_slots)
     acquisition = Acquisition(own, profiles, clock, variants)
-    return framing_of(acquisition, initial_pass(acquisition), possible)
+    return framing_of(acquisition, initial_pass(acquisition), possible, context)
 
 
 @pytest.mark.parametrize("sent", ["paper-8k65", "paper-17k3", "paper-34k6"])
 def test_one_header_in_view_leaves_the_length_open(sent: str) -> None:
     """Whatever was sent: the slots of the window are those of either screen."""
-    framing = framed(sent, "paper-8k65", 520 - 30.0, 66)
-    assert framing.prior == pytest.approx(PRIOR)
-    assert framing.length == pytest.approx(PRIOR, abs=0.1)
-    assert framing.gain == pytest.approx(0.0, abs=0.5)
+    found = framed(sent, "paper-8k65", 520 - 30.0, 66)
+    assert found.prior == pytest.approx(PRIOR)
+    assert found.length == pytest.approx(PRIOR, abs=0.1)
+    assert found.gain == pytest.approx(0.0, abs=0.5)
+
+
+@pytest.mark.parametrize(("rate_hz", "low", "high"), [(8650.0, 0.9, 1.0), (17300.0, 0.0, 0.2), (34600.0, 0.0, 0.3)])
+def test_the_exposure_that_a_file_states_speaks_for_a_slot_rate(
+    rate_hz: float, low: float, high: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The light shows an exposure of a slot, the file that it lasts one of a screen's slot rate."""
+    hypothesis = CameraHypothesis(ROWS_PER_SLOT, 70, False, np.zeros(4), 1.0, 0.0, 0.0, np.zeros(4), 0.05)
+    camera = FrameCamera(None, 1 / (ROWS_PER_SLOT * 8650), 1 / 8650, None, "srgb", hypothesis=hypothesis)
+    frame = Frame(np.zeros((4, 4), np.uint8), "photo", metadata=Metadata(exposure_s=1 / rate_hz))
+    monkeypatch.setattr(framing, "settle", lambda *_: (camera, 0.0))
+    context = FrameContext(FrameCache(frame), np.zeros((4, 2)), camera, SCREENS)
+    assert low <= framed("paper-8k65", "paper-8k65", 520 - 30.0, 66, context=context).length <= high
 
 
 @pytest.mark.parametrize("n_slots", [78, 84, 100])
@@ -48,14 +69,14 @@ def test_a_header_that_should_show_and_does_not_excludes_the_length(n_slots: int
 
 
 def test_two_headers_in_view_settle_the_length() -> None:
-    framing = framed("paper-8k65", "paper-8k65", 210 - 5.0, 150)
-    assert framing.length == 1.0
-    assert framing.bursts == pytest.approx(1.0)
+    found = framed("paper-8k65", "paper-8k65", 210 - 5.0, 150)
+    assert found.length == 1.0
+    assert found.bursts == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("name", "certainty"), [("paper-8k65", 2 / 3), ("data-8k65", 1.0)])
 def test_copies_that_show_different_slots_may_be_two_packets(name: str, certainty: float) -> None:
     """One boundary in three of a screen of three copies is that of two bursts; one of single copies knows no others."""
-    framing = framed("paper-8k65", name, 210 - 35.0, 66, name)
-    assert framing.length == pytest.approx(1.0)
-    assert framing.bursts == pytest.approx(certainty, abs=0.1)
+    found = framed("paper-8k65", name, 210 - 35.0, 66, name)
+    assert found.length == pytest.approx(1.0)
+    assert found.bursts == pytest.approx(certainty, abs=0.1)
