@@ -118,7 +118,8 @@ def recorded(scene: Scene, at: Place, photos: int = 1, encoding: Encoding = _ENC
         paths = [write_still(trial.capture, Path(folder) / str(trial.index)) for trial in trials]
         if not trials:
             paths, (codec, effort, bit_rate) = [Path(folder) / "0.mp4"], encoding
-            write_video((frame.rgb for frame in frames), paths[0], codec, scene.frame_rate_hz, bit_rate, effort)
+            rgb = (frame.rgb for frame in frames)
+            write_video(rgb, paths[0], codec, scene.frame_rate_hz, bit_rate, effort, scene.orientation)
         about = {"screen": scene.screen.name, "camera": scene.camera_name, "rows_per_slot": scene.rows_per_slot}
         known: dict[str, Any] = {"truth": msgspec.convert(whole, Truth, str_keys=True), "whole_truth": whole}
         corners, cameras = known_corners(exposure), (known_camera(exposure),)

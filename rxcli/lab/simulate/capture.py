@@ -205,7 +205,7 @@ def write_capture(
     if file_format in CODECS:
         bits = 16 if CODECS[file_format].bits > 8 else 8
         frames = (recording.frame(number).developed(bits) for number in progress(range(scene.n_frames)))
-        write_video(frames, path, file_format, scene.frame_rate_hz, bit_rate)
+        write_video(frames, path, file_format, scene.frame_rate_hz, bit_rate, orientation=scene.orientation)
     elif file_format == "jpeg":
         path.write_bytes(recording.frame().jpeg)
     elif file_format.startswith("dng"):

@@ -168,6 +168,10 @@ CODECS = {
 }
 
 
+#: EXIF orientation of a camera held upside down.
+_UPSIDE_DOWN = 3
+
+
 def write_video(
     frames: Iterable[NDArray[np.generic]],
     path: Path,
@@ -175,6 +179,7 @@ def write_video(
     frame_rate_hz: float,
     bit_rate: int | None = None,
     preset: str = "veryfast",
+    orientation: int = 1,
 ) -> None:
     """Compress developed pictures into a clip.
 
@@ -185,6 +190,7 @@ def write_video(
         frame_rate_hz: of the clip.
         bit_rate: bits per second; None for the encoder's constant quality.
         preset: how much work the encoder does; see x264 and x265.
+        orientation: EXIF orientation of a camera held upright or upside down, 1 or 3, which the container notes.
 
     Raises:
         UsageError: this machine's FFmpeg lacks the codec.
@@ -196,6 +202,8 @@ def write_video(
         for number, rgb in enumerate(frames):
             if stream is None:
                 stream = _add_stream(container, settings, rate, rgb.shape, bit_rate, preset)
+                if orientation == _UPSIDE_DOWN:
+                    stream.set_display_rotation(180)
             pixels = "rgb24" if rgb.dtype == np.uint8 else "rgb48le"
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), pixels)
             converted = frame.reformat(format=settings.pixel_format, dst_colorspace=_BT709, **ranges)
