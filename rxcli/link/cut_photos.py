@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from rxcli.types import FrameSoftBits, MessageKind
 Found = tuple[tuple[MessageKind, bytes], Placement]
 #: Largest number of sums of photographs that are kept, of ways to read one, and of sums that are decoded at once.
 _MAX_SUMS, _MAX_VIEWS, _BATCH = 192, 96, 64
+#: Views of a photograph that are decoded by themselves first; and log-likelihood ratio of zeros that ranks views.
+_ALONE, _CLEAR_ZEROS = 64, 8.0
 #: Log-likelihood ratio below which photographs do not show the same text; and from which they certainly do.
 _MIN_SIMILARITY, _SAME = -8.0, 16.0
 #: Information at which a text is decoded, relative to its bits; and log-likelihood ratio below which a bit is unknown.
@@ -34,6 +36,13 @@ class _Sum:
     level: float
     #: Of the last photograph.
     placement: Placement
+    #: Log-likelihood ratio of the zeros after a message, of each photograph by itself.
+    zeros: float = 0.0
+
+    @property
+    def rank(self) -> float:
+        """The larger, the likelier."""
+        return self.similarity + self.zeros
 
 
 class CutPhotos:
@@ -51,12 +60,13 @@ class CutPhotos:
 
     def add(self, soft: FrameSoftBits) -> list[Found]:
         """Add a photograph, and return the text that it completes with the placement of its columns."""
-        views = list(_views(soft))[:_MAX_VIEWS]
+        views = self._ranked(list(_views(soft)))[:_MAX_VIEWS]
         joined = [pair for known in self._sums for view in views if (pair := _joined(known, view)) is not None]
-        # Sums of more photographs first: without an overlap nothing speaks for one or another.
-        sums = [*sorted(joined, key=lambda s: -s.similarity), *views]
+        joined.sort(key=lambda s: -s.rank)
+        # The likeliest alone, then sums of more photographs.
+        sums = [*views[:_ALONE], *joined[: 2 * _MAX_SUMS], *views[_ALONE:]]
         certain = [s for s in joined if s.similarity > _SAME]
-        self._sums = (certain and sorted(certain, key=lambda s: -s.similarity)[:_MAX_SUMS]) or [
+        self._sums = (certain and sorted(certain, key=lambda s: -s.rank)[:_MAX_SUMS]) or [
             *sums[:_MAX_SUMS],
             *self._sums,
         ][: 2 * _MAX_SUMS]
@@ -66,6 +76,18 @@ class CutPhotos:
                 self._sums = [found[1]]
                 return [(found[0], found[1].placement)]
         return []
+
+    def _ranked(self, views: list[_Sum]) -> list[_Sum]:
+        """Views by the zeros that they show after a message, otherwise in their order."""
+        if not views:
+            return []
+        shown = [
+            known_bits(layout, np.stack([gathered(layout, view.total[None]) for view in views])).llr
+            for layout in self._layouts
+        ]
+        zeros = np.max(shown, axis=0) if shown else np.zeros(len(views))
+        ranked = [replace(view, zeros=float(llr)) for view, llr in zip(views, zeros, strict=True)]
+        return sorted(ranked, key=lambda view: -round(view.zeros / _CLEAR_ZEROS))
 
     def _read(self, length: int, sums: list[_Sum]) -> Iterator[tuple[tuple[MessageKind, bytes], _Sum]]:
         """Texts of a length that sums show."""
@@ -117,4 +139,4 @@ def _joined(known: _Sum, view: _Sum) -> _Sum | None:
     gain = level - known.level - view.level
     if gain < _MIN_SIMILARITY:
         return None
-    return _Sum(total, known.similarity + gain, level, view.placement)
+    return _Sum(total, known.similarity + gain, level, view.placement, known.zeros + view.zeros)

@@ -81,8 +81,8 @@ def _in_total_order(options: ReceiverOptions) -> ReceiverOptions:
 
 def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None = None) -> FrameResult:
     """Receive one frame as a photograph; see `receive`."""
-    cache = FrameCache(frame).in_blinking_colours()
     with one_blas_thread():
+        cache = FrameCache(frame).in_blinking_colours()
         received = receive_either_way(cache, _in_total_order(options), _receive_still)
         soft = _with_cut_packets(cache, received, _in_total_order(options))
     received = received._replace(result=replace(received.result, soft_bits=soft))

@@ -10,7 +10,7 @@ import pytest
 from rxcli.lab.benchmark.goodput import detect
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.population import Population
-from rxcli.link import ldpc
+from rxcli.link import cut_photos, ldpc
 from rxcli.link.collector import Collector
 from rxcli.link.cut_photos import CutPhotos
 from rxcli.link.encoder import message
@@ -51,6 +51,15 @@ def test_photos_of_different_parts_add_up() -> None:
     came = [receiver.add(photo(range(k, k + 3), rng, number=k)) for k in (1, 5)]
     assert [len(events) for events in came] == [0, 1]
     assert receiver.messages[0].text == TEXT
+
+
+def test_a_photo_is_read_alone_after_one_that_fits_in_many_ways(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cut_photos, "_MAX_SUMS", 8)
+    receiver, rng = LinkReceiver(COLUMNS, SYMBOLS), np.random.default_rng(9)
+    llr = np.zeros((1, SYMBOLS, COLUMNS, 7), np.float32)
+    llr[:, :4] = rng.choice((-6, 6), (1, 4, COLUMNS, 7))
+    receiver.add(FrameSoftBits(np.arange(1), llr, 0, "0", open_start=True))
+    assert [event.text for event in receiver.add(photo(range(2, 8), rng, number=1))] == [TEXT]  # type: ignore[union-attr]
 
 
 def test_a_symbol_hardly_in_view_gives_no_soft_bits() -> None:
