@@ -33,13 +33,26 @@ class FirstFrames:
     texture: ScreenTexture | None
     #: Corners (4, 2) that were found in each frame, carried back to the first, less those found there.
     differences: tuple[FloatArray, ...]
+    #: Whether the screen was found in what changed from the first to the second.
+    is_cancelled: bool = False
 
     @classmethod
     def begin(cls, frame: Frame, camera: ClipCamera) -> FirstFrames | Failure:
         """Search the first frame."""
         located = camera.locate(FrameCache(frame))
-        if isinstance(located, Failure):
-            return located
+        return located if isinstance(located, Failure) else cls._at(frame, camera, located)
+
+    @classmethod
+    def in_changes(cls, frame: Frame, following: Frame, camera: ClipCamera) -> FirstFrames | None:
+        """Search the first frame by what changed from it to the next; None where that shows no screen."""
+        located = camera.locate_in_changes(FrameCache(frame), following)
+        if located is None or isinstance(located, Failure):
+            return None
+        # The picture cancels in changes, so that no further outline is needed.
+        return replace(cls._at(frame, camera, located), texture=None, is_cancelled=True)
+
+    @classmethod
+    def _at(cls, frame: Frame, camera: ClipCamera, located: Located) -> FirstFrames:
         corners = located.context.sampled_corners
         texture = None if camera.options.corners is not None else ScreenTexture(frame, corners, None)
         return cls((frame,), located, texture, (np.zeros_like(corners),))
@@ -69,10 +82,15 @@ class FirstFrames:
 
     def with_frame(self, frame: Frame, camera: ClipCamera) -> FirstFrames:
         """These frames and one more; it is searched for its outline and its camera as far as they are unsure."""
+        if len(self.frames) == 1 and self.texture is not None and not self.located.is_plain:
+            again = FirstFrames.in_changes(self.frames[0], frame, camera)
+            if again is not None and (self.located.is_open or again.located.evidence > self.located.evidence):
+                return again.with_frame(frame, camera)
+        outlines = [self.located.outline] if self.is_cancelled else None
         longer, located, found = replace(self, frames=(*self.frames, frame)), self.located, None
         unsure = located.camera_error == np.inf or (located.camera_error > 0 and self.shows_little)
         if unsure or not (self._agree or located.is_plain):
-            found = (camera if unsure else replace(camera, context=located.context)).locate(FrameCache(frame))
+            found = (camera if unsure else replace(camera, context=located.context)).locate(FrameCache(frame), outlines)
             longer = replace(longer, located=located.with_surer_camera(found) if unsure else located)
         return longer if self._agree else longer._compared(frame, found)
 

@@ -16,7 +16,7 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.screen.outline import Outline
-from rxcli.receiver.search import Found, search
+from rxcli.receiver.search import Found, screen_in_changes, search
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.settings import SETTINGS as search_settings
 from rxcli.receiver.still import initial_pass
@@ -48,9 +48,19 @@ class Located:
         return np.inf if isinstance(self.found, Failure) else camera.estimated["line_delay_s"][1] / camera.line_delay_s
 
     @property
+    def evidence(self) -> float:
+        """Of packets."""
+        return self.found.best.evidence if isinstance(self.found, Found) else 0.0
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there are no packets that settle the outline; those of long exposures show on many outlines."""
+        return not isinstance(self.found, Found) or self.found.best.reception.is_long
+
+    @property
     def is_plain(self) -> bool:
         """Whether packets settle the outline beyond doubt."""
-        return isinstance(self.found, Found) and self.found.best.evidence >= search_settings.plain
+        return self.evidence >= search_settings.plain and not self.is_open
 
     def moved_to(self, corners: FloatArray) -> Located:
         """The same with the screen at the corners (4, 2)."""
@@ -97,9 +107,12 @@ class ClipCamera:
         """What is known of the camera of another frame: nothing where it is of another kind."""
         return self if self.fits(frame) and "tracking" in self.options.skip else replace(self, context=None)
 
-    def locate(self, cache: FrameCache) -> Located | Failure:
-        """Find the screen in a frame, and the camera where it is not known; a failure where there is none."""
-        found = search(cache, self.options, self.context)
+    def locate(self, cache: FrameCache, outlines: list[Outline] | None = None) -> Located | Failure:
+        """Find the screen in a frame, and the camera where it is not known; a failure where there is none.
+
+        `outlines` are of the screen; None: it is looked for.
+        """
+        found = search(cache, self.options, self.context, outlines=outlines)
         context = found.best.context if isinstance(found, Found) else found.context or self.context
         if found.outline is None or context is None:
             assert isinstance(found, Failure)
@@ -109,6 +122,27 @@ class ClipCamera:
             framing = framing_of(found.best.acquisition, found.best.reception, found.screens).length
         context = replace(context, cache=cache, sampled_corners=found.outline.corners)
         return Located(found.outline, context, found, framing)
+
+    def locate_again(self, cache: FrameCache, outline: Outline | None, corners: FloatArray | None) -> Located | Failure:
+        """The same of a screen that was lost, which is where it was unless packets of a short exposure contradict.
+
+        Args:
+            cache: the frame.
+            outline: where a long exposure showed the screen; None: nothing is known.
+            corners: (4, 2) of the screen in the last frame that showed it.
+        """
+        if outline is None or corners is None:
+            return self.locate(cache)
+        there = self.locate(cache, [replace(outline, corners=corners, strips=None, grid=None)])
+        if isinstance(there, Located) and there.evidence:
+            return there
+        anywhere = self.locate(cache)
+        return there if isinstance(anywhere, Failure) or anywhere.is_open else anywhere
+
+    def locate_in_changes(self, cache: FrameCache, other: Frame) -> Located | Failure | None:
+        """The same by what changed from a frame to another one; None where that shows no screen."""
+        outlines = screen_in_changes(cache, other, self.options)
+        return self.locate(cache, outlines) if outlines else None
 
     def acquire(
         self, located: Located, start: Start | None, cache: FrameCache

@@ -27,6 +27,7 @@ from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.passes import Reception, shows_steady_light
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.light import slot_llr
+from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode
@@ -63,6 +64,8 @@ class Known:
     camera: ClipCamera
     #: (4, 2) of the screen in the last frame that showed it.
     corners: FloatArray | None = None
+    #: Where the screen was found last, if by a long exposure.
+    outline: Outline | None = None
     #: The last frame.
     frame: Frame | None = None
 
@@ -73,6 +76,8 @@ class Acquiring:
 
     known: Known
     frames: FirstFrames | None = None
+    #: A frame that shows no screen by itself, and why.
+    alone: tuple[Frame, Failure] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,6 +112,9 @@ def step(state: State, frame: Frame) -> tuple[State, list[FrameResult]]:
 
 def finish(state: State) -> list[FrameResult]:
     """The results still held back."""
+    if isinstance(state, Acquiring) and state.alone is not None:
+        after, results = _receive(Lost(state.known), *state.alone)
+        return results + after.known.ledger.finish()
     if not isinstance(state, Acquiring) or state.frames is None:
         return state.known.ledger.finish()
     after, results = _receive_first(state.known, state.frames)
@@ -119,15 +127,25 @@ def finish(state: State) -> list[FrameResult]:
 def _acquire(state: Acquiring, frame: Frame) -> tuple[State, list[FrameResult]]:
     """Take one of the first frames; they are received once they agree."""
     known, before = state.known, state.frames
-    if before and before.frames[0].pixels.shape != frame.pixels.shape:
+    if before and not _are_alike(before.frames[0], frame):
         after, results = _receive_first(known, before)
         anew, more = _acquire(Acquiring(replace(after.known, camera=after.known.camera.of_frame(frame))), frame)
         return anew, results + more
+    if state.alone is not None:
+        earlier, failure = state.alone
+        before = FirstFrames.in_changes(earlier, frame, known.camera) if _are_alike(earlier, frame) else None
+        if before is None or not before.located.evidence:
+            after, results = _receive(Lost(known), earlier, failure)
+            anew, more = _acquire(Acquiring(after.known), frame)
+            return anew, results + more
     frames = before.with_frame(frame, known.camera) if before else FirstFrames.begin(frame, known.camera)
     if isinstance(frames, Failure):
-        after, results = _receive(Lost(known), frame, frames)
-        return Acquiring(after.known), results
+        return Acquiring(known, alone=(frame, frames)), []
     return _receive_first(known, frames) if frames.are_enough else (Acquiring(known, frames), [])
+
+
+def _are_alike(frame: Frame, other: Frame) -> bool:
+    return frame.pixels.shape == other.pixels.shape and frame.pixels.dtype == other.pixels.dtype
 
 
 def _receive_first(known: Known, held: FirstFrames) -> _Step:
@@ -227,7 +245,7 @@ def _receive_anew(
     """
     frame, timer, ledger = cache.frame, cache.timer, known.ledger
     camera = known.camera.of_frame(frame)
-    located = located or camera.locate(cache)
+    located = located or camera.locate_again(cache, known.outline, known.corners)
     if isinstance(located, Failure):
         return Lost(replace(known, camera=camera)), located, None
     ledger.certainty = located.outline.certainty
@@ -245,6 +263,7 @@ def _receive_anew(
         return Lost(known), Failure("no_signal", STEADY_LIGHT), None
     if assemble.all_dark(reception.snr):
         return Lost(known), Failure("no_signal", _NOTHING_LIT), None
+    known = replace(known, outline=located.outline if reception.is_long else None)
     view = View(
         acquired.context,
         acquisition,

@@ -226,7 +226,7 @@ class TrackedScreen:
             best = max(map(with_contrast, slots.tolist()), key=itemgetter(0))
             if best[0] > contrast + SETTINGS.header_lead:  # A sliver of a header fits nearly as well elsewhere.
                 contrast, clock = best
-        return clock if contrast >= SETTINGS.min_header else None
+        return clock if contrast >= SETTINGS.min_header or is_known else None
 
     # -- where the screen is -------------------------------------------------------------------------------------------
 
