@@ -18,7 +18,9 @@ from rxcli.receiver.clip.scene import followed_outline
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.registration import ScreenTexture
+from rxcli.receiver.search import screen_in_changes
 from rxcli.types import FloatArray, Frame
 
 
@@ -48,8 +50,7 @@ class FirstFrames:
         located = camera.locate_in_changes(FrameCache(frame), following)
         if located is None or isinstance(located, Failure):
             return None
-        # The picture cancels in changes, so that no further outline is needed.
-        return replace(cls._at(frame, camera, located), texture=None, is_cancelled=True)
+        return replace(cls._at(frame, camera, located), is_cancelled=True)
 
     @classmethod
     def _at(cls, frame: Frame, camera: ClipCamera, located: Located) -> FirstFrames:
@@ -82,7 +83,8 @@ class FirstFrames:
 
     def with_frame(self, frame: Frame, camera: ClipCamera) -> FirstFrames:
         """These frames and one more; it is searched for its outline and its camera as far as they are unsure."""
-        if len(self.frames) == 1 and self.texture is not None and not self.located.is_plain:
+        is_first = len(self.frames) == 1
+        if is_first and self.texture is not None and not (self.is_cancelled or self.located.is_plain):
             again = FirstFrames.in_changes(self.frames[0], frame, camera)
             if again is not None and (self.located.is_open or again.located.evidence > self.located.evidence):
                 return again.with_frame(frame, camera)
@@ -92,19 +94,23 @@ class FirstFrames:
         if unsure or not (self._agree or located.is_plain):
             found = (camera if unsure else replace(camera, context=located.context)).locate(FrameCache(frame), outlines)
             longer = replace(longer, located=located.with_surer_camera(found) if unsure else located)
-        return longer if self._agree else longer._compared(frame, found)
+        if self._agree or (self.is_cancelled and is_first):
+            return longer
+        if self.is_cancelled:
+            changes = screen_in_changes(FrameCache(self.frames[-1]), frame, camera.options)
+            return longer._compared(self.frames[-1], changes[0] if changes else None)
+        return longer._compared(frame, None if found is None else found.outline, is_followed=found is None)
 
-    def _compared(self, frame: Frame, found: Located | Failure | None) -> FirstFrames:
-        """The same with the outline of a further frame, less its motion since the first; None: it is followed."""
+    def _compared(self, frame: Frame, outline: Outline | None, *, is_followed: bool = False) -> FirstFrames:
+        """The same with the outline of a further frame, less its motion since the first; or one that is followed."""
         assert self.texture is not None
         context = self.located.context
         moved = self.texture.find(frame)
         if not moved.is_precise:
             moved = replace(moved, corners=context.sampled_corners)
-        if found is None:
+        corners = None if outline is None else outline.corners
+        if is_followed:
             corners = followed_outline(frame, moved.corners + self.differences[-1], context.screens[0])
-        else:
-            corners = None if found.outline is None else found.outline.corners
         reach = float(np.ptp(context.sampled_corners[:, 0])) / 2
         if corners is None or not moved.fits or np.abs(corners - moved.corners).max() > reach:
             return replace(self, texture=None)

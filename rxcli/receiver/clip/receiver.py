@@ -30,6 +30,7 @@ from rxcli.receiver.light import slot_llr
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.refusal import STEADY_LIGHT
+from rxcli.receiver.search.settings import SETTINGS as search_settings
 from rxcli.receiver.still import apply_autoencoder, decode
 from rxcli.receiver.sync import tracking
 from rxcli.types import FloatArray, Frame, FrameResult, OnTaps
@@ -134,13 +135,16 @@ def _acquire(state: Acquiring, frame: Frame) -> tuple[State, list[FrameResult]]:
     if state.alone is not None:
         earlier, failure = state.alone
         before = FirstFrames.in_changes(earlier, frame, known.camera) if _are_alike(earlier, frame) else None
-        if before is None or not before.located.evidence:
+        if before is None or before.located.evidence < search_settings.plain_estimate:
             after, results = _receive(Lost(known), earlier, failure)
             anew, more = _acquire(Acquiring(after.known), frame)
             return anew, results + more
     frames = before.with_frame(frame, known.camera) if before else FirstFrames.begin(frame, known.camera)
     if isinstance(frames, Failure):
-        return Acquiring(known, alone=(frame, frames)), []
+        if frames.status == "no_screen":
+            return Acquiring(known, alone=(frame, frames)), []
+        after, results = _receive(Lost(known), frame, frames)
+        return Acquiring(after.known), results
     return _receive_first(known, frames) if frames.are_enough else (Acquiring(known, frames), [])
 
 
