@@ -12,8 +12,10 @@ import pytest
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.clip.ledger import Ledger
 from rxcli.receiver.clip.views import Waiting
+from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.receive import receive
-from rxcli.receiver.search import cameras
+from rxcli.receiver.search import cameras, screen_in_changes
+from rxcli.receiver.search.outlines import possible_screens
 from rxcli.types import FrameResult, Metadata
 from tests.receiver.test_video import Clip, scored, simulate
 
@@ -44,6 +46,20 @@ def test_a_clip_of_long_exposures_is_received(exposure_slots: float) -> None:
     assert score.error_free >= 0.75 * score.expected > 60
     believed = [p for result in results for p in result.packets if p.confidence >= 0.9]
     assert sum(p.bit_errors != 0 for p in believed) <= 0.03 * len(believed)
+
+
+def test_a_screen_is_found_in_what_changed_between_frames() -> None:
+    """The picture cancels there; in the frames alone its texture hides the columns of a long exposure."""
+    clip = simulate(8, 2, picture="coins", exposure_slots=5.0, height_scale=1.0)
+    first, second = clip.frames
+    corners = clip.options.corners
+    assert corners is not None
+    column_px = np.ptp(corners[:, 0]) / 20
+    found = screen_in_changes(FrameCache(first), second, ReceiverOptions())
+    assert np.abs(found[0].corners - corners)[:, 0].max() < 0.6 * column_px
+    alone = possible_screens(FrameCache(first), ReceiverOptions())
+    assert not alone or np.abs(alone[0][0].corners - corners)[:, 0].max() > column_px
+    assert screen_in_changes(FrameCache(first), first, ReceiverOptions()) == []
 
 
 def test_the_camera_is_estimated_once_and_refitted(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:

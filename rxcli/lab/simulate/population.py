@@ -91,8 +91,7 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         sensor = replace(scene.sensor, full_scale_e=full_scale_e)
         scene = replace(scene, light_e_per_s=light_e_per_s * _within(rng, self.light), sensor=sensor)
         roll, yaw, pitch = self.aim * rng.normal(0, _ANGLES_DEG)
-        # Clips are written without a note of how the camera was held.
-        turned = rng.random() < _UPSIDE_DOWN and self.n_frames == 1
+        turned = rng.random() < _UPSIDE_DOWN
         scene = replace(scene.metered(exposure_s), orientation=3 if turned else 1)
         place = np.clip(self.aim * rng.normal(0, _PLACE, 2), -1, 1)
         return placed(scene, rng.uniform(*self.fill), (roll + 180 * turned, yaw, pitch), place)

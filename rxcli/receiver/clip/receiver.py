@@ -135,7 +135,7 @@ def _acquire(state: Acquiring, frame: Frame) -> tuple[State, list[FrameResult]]:
     if state.alone is not None:
         earlier, failure = state.alone
         before = FirstFrames.in_changes(earlier, frame, known.camera) if _are_alike(earlier, frame) else None
-        if before is None or before.located.evidence < search_settings.plain_estimate:
+        if before is None or before.located.evidence < search_settings.few_packets:
             after, results = _receive(Lost(known), earlier, failure)
             anew, more = _acquire(Acquiring(after.known), frame)
             return anew, results + more
