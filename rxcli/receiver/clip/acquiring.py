@@ -85,9 +85,9 @@ class FirstFrames:
         """These frames and one more; it is searched for its outline and its camera as far as they are unsure."""
         is_first = len(self.frames) == 1
         if is_first and self.texture is not None and not (self.is_cancelled or self.located.is_plain):
-            again = FirstFrames.in_changes(self.frames[0], frame, camera)
-            if again is not None and (self.located.is_open or again.located.evidence > self.located.evidence):
-                return again.with_frame(frame, camera)
+            by_changes = FirstFrames.in_changes(self.frames[0], frame, camera)
+            if by_changes is not None and (self.located.is_open or by_changes.located.evidence > self.located.evidence):
+                return by_changes.with_frame(frame, camera)
         outlines = [self.located.outline] if self.is_cancelled else None
         longer, located, found = replace(self, frames=(*self.frames, frame)), self.located, None
         unsure = located.camera_error == np.inf or (located.camera_error > 0 and self.shows_little)

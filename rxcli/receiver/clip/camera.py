@@ -139,9 +139,9 @@ class ClipCamera:
         anywhere = self.locate(cache)
         return there if isinstance(anywhere, Failure) or anywhere.is_open else anywhere
 
-    def locate_in_changes(self, cache: FrameCache, other: Frame) -> Located | Failure | None:
-        """The same by what changed from a frame to another one; None where that shows no screen."""
-        outlines = screen_in_changes(cache, other, self.options)
+    def locate_in_changes(self, cache: FrameCache, following: Frame) -> Located | Failure | None:
+        """The same by what changed from a frame to the following one; None where that shows no screen."""
+        outlines = screen_in_changes(cache, following, self.options)
         return self.locate(cache, outlines) if outlines else None
 
     def acquire(

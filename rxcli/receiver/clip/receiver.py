@@ -148,8 +148,8 @@ def _acquire(state: Acquiring, frame: Frame) -> tuple[State, list[FrameResult]]:
     return _receive_first(known, frames) if frames.are_enough else (Acquiring(known, frames), [])
 
 
-def _are_alike(frame: Frame, other: Frame) -> bool:
-    return frame.pixels.shape == other.pixels.shape and frame.pixels.dtype == other.pixels.dtype
+def _are_alike(frame: Frame, following: Frame) -> bool:
+    return frame.pixels.shape == following.pixels.shape and frame.pixels.dtype == following.pixels.dtype
 
 
 def _receive_first(known: Known, held: FirstFrames) -> _Step:

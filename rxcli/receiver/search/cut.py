@@ -38,8 +38,8 @@ class _Candidate:
         """Whether its symbols begin where those of a better one do, by the same screen read the same way."""
         if self.acquisition.screen != better.acquisition.screen or self.is_reversed != better.is_reversed:
             return False
-        apart = (self._symbol_phase - better._symbol_phase) % SLOTS_PER_SYMBOL
-        return min(apart, SLOTS_PER_SYMBOL - apart) < SETTINGS.same_symbols_slots
+        ahead = (self._symbol_phase - better._symbol_phase) % SLOTS_PER_SYMBOL
+        return min(ahead, SLOTS_PER_SYMBOL - ahead) < SETTINGS.same_symbols_slots
 
     @property
     def is_reversed(self) -> bool:

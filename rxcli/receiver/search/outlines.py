@@ -126,10 +126,10 @@ def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
     return outlines
 
 
-def screen_in_changes(cache: FrameCache, other: Frame, options: ReceiverOptions) -> list[Outline]:
+def screen_in_changes(cache: FrameCache, following: Frame, options: ReceiverOptions) -> list[Outline]:
     """Outlines of the clearest screen in what changed from a frame to another one; none if nothing did."""
     with cache.timer("geometry"):
-        changes = changed_light(cache.frame, other, DEFAULT_TONE)
+        changes = changed_light(cache.frame, following, DEFAULT_TONE)
     screens = possible_screens(FrameCache(changes), options)
     return screens[0] if screens else []
 
