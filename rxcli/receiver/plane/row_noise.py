@@ -41,7 +41,7 @@ class RowNoise:
 
     #: (R,) linear light.
     light: Float32Array
-    #: (4,) rows by which picture rows are bent against sensor rows, see `_bends`.
+    #: (5,) rows by which picture rows are bent against sensor rows, see `_bends`.
     curvature: FloatArray
 
     def removed(self, light: Float32Array, x: FloatArray) -> Float32Array:
@@ -110,9 +110,9 @@ def without_row_noise(plane: LightPlane, noise: RowNoise) -> LightPlane:
 
 
 def _bends(x: FloatArray, n_rows: int) -> FloatArray:
-    """(4, N, R) rows that a unit of k1, k2, p1 and p2 moves cells at x against those in the middle of the picture."""
+    """(5, N, R) rows that a unit of k1, k2 (in two parts), p1 and p2 moves cells at x against those in the middle."""
     x, y = x[:, None], (np.arange(n_rows) / n_rows - 0.5)[None]
-    return n_rows * np.stack(np.broadcast_arrays(x * x * y, x * x * y * (x * x + 2 * y * y), x * x, x * y))
+    return n_rows * np.stack(np.broadcast_arrays(x**2 * y, x**4 * y, x**2 * y**3, x**2, x * y))
 
 
 def _sensor_rows(x: FloatArray, n_rows: int, curvature: FloatArray) -> FloatArray:
@@ -128,13 +128,15 @@ def _straight(light: Float32Array, x: FloatArray, curvature: FloatArray) -> Floa
 
 
 def _curvature(light: Float32Array, x: FloatArray) -> FloatArray:
-    """(4,) bends by which cells (N, R) at x differ in their sensor rows."""
+    """(5,) bends by which cells (N, R) at x differ in their sensor rows; those under which they have most in common."""
     length = light.shape[1] // _BANDS
-    terms, curvature = _bends(x, light.shape[1])[..., length // 2 :: length][..., :_BANDS], np.zeros(4)
-    for step in _STEPS:
+    terms, curvature = _bends(x, light.shape[1])[..., length // 2 :: length][..., :_BANDS], np.zeros(5)
+    found = []
+    for step in (*_STEPS, 1):
         straight = _straight(light, x, curvature)
         change = straight - local_mean(straight, _OCTAVES[-1])
         change /= change.std(axis=1, keepdims=True) + np.float32(TINY)
+        found.append((float(change.mean(axis=0).var()), curvature))
         products = (change[:-step] * np.roll(change[step:], lag, axis=1) for lag in range(-_LAGS, _LAGS + 1))
         by_band = [each[:, : length * _BANDS].reshape(len(each), _BANDS, length).mean(axis=2) for each in products]
         similarity = np.stack(by_band)
@@ -142,10 +144,10 @@ def _curvature(light: Float32Array, x: FloatArray) -> FloatArray:
         before, peak, after = (np.take_along_axis(similarity, top + shift, axis=0)[0] for shift in (-1, 0, 1))
         lag = top[0] - _LAGS + peak_offset(before, peak, after)
         weight = (np.maximum(peak - _MIN_CORRELATION, 0) * (peak > np.maximum(before, after))).ravel()
-        jacobian = (terms[:, step:] - terms[:, :-step]).reshape(4, -1)
+        jacobian = (terms[:, step:] - terms[:, :-step]).reshape(5, -1)
         normal = (jacobian * weight) @ jacobian.T
-        curvature = curvature + np.linalg.solve(normal + TINY * np.eye(4), jacobian @ (weight * lag.ravel()))
-    return curvature
+        curvature = curvature + np.linalg.solve(normal + TINY * np.eye(5), jacobian @ (weight * lag.ravel()))
+    return max(found, key=lambda scored: scored[0])[1]
 
 
 def _offset(change: Float32Array, level: Float32Array) -> Float32Array:
