@@ -108,7 +108,8 @@ def cameras_by_slots(
             camera = estimated_camera(hypothesis, screens[0].slot_rate_hz, frame)
             own = [(s, relabelled_camera(camera, s, frame)) for s in screens if s.columns == n_columns]
             off = [abs(np.log(c.exposure_s * s.slot_rate_hz / hypothesis.exposure_slots)) for s, c in own]
-            yield from (pair for pair, far in zip(own, off, strict=True) if far < min(off) + SETTINGS.near_exposures)
+            near = max(min(off), SETTINGS.near_exposures)
+            yield from (pair for pair, distance in zip(own, off, strict=True) if distance <= near)
 
 
 def estimated_camera(hypothesis: CameraHypothesis, slot_rate_hz: float, frame: Frame) -> FrameCamera:

@@ -66,8 +66,8 @@ class SearchSettings:
     max_cut: int = 4
     same_symbols_slots: float = 0.6
     cut_start: float = 10.0
-    #: Natural logarithm of the ratio of exposures, stated and by the stripes, beyond the nearest screen's.
-    near_exposures: float = 0.4
+    #: Natural logarithm of the ratio of exposures, stated and by the width of stripes, up to which they may agree.
+    near_exposures: float = 0.7
 
     #: Fits of the exposure; shortest one, slots, that the light shows; standard deviation of its logarithm; and least
     #: log-likelihood, as files may state wrong ones.
