@@ -43,8 +43,8 @@ _PLAIN_CONTRAST, _N_FITTED = 0.2, 3
 _ONE_SCREEN = 0.9
 #: Contrast, times what chance gives, from which packets are looked for; of a part of a picture it must be plainer.
 _POSSIBLE_CONTRAST = 0.5
-#: Share of the best grid's score from which a second one is proposed, and its log-odds: it is right in one picture of
-#: ten; mean distance from which grids differ, columns.
+#: Share of the best grid's likelihood from which a second one is proposed, and its log-odds: it is right in one picture
+#: of ten; mean distance from which grids differ, columns.
 _NEARLY_BEST, _SECOND, _DIFFERENT = 0.98, -25.0, 0.2
 #: Log-odds relative to the likeliest first column down to which another one is possible.
 _MIN_LOG_ODDS = -7.0
@@ -205,11 +205,17 @@ def wide_grids(strips: PictureStrips, sigma: float, rivals: Sequence[Grid] = (),
     near = [moved_by_waveforms(some, grid, sigma, _FIRST_STEPS) for grid in starts]
     fitted = [with_light(strips, moved_by_waveforms(strips, grid, sigma, _LAST_STEPS), sigma) for grid in near]
     found = sorted((grid for grid in fitted if _stands_out(strips, grid, least)), key=_score, reverse=True)
-    rivals = [grid for grid in found if _differ(strips, grid, found[0])]
-    same = (grid for grid in found if not _differ(strips, grid, found[0]))
+    if not found:
+        return []
     # Of grids with the same columns the likeliest is nearest to them.
-    best = [max(same, key=lambda grid: grid.explained + grid.contrast)] if found else []
-    return best + [grid for grid in rivals if _score(grid) > _NEARLY_BEST * _score(found[0])][:1]
+    best = max((grid for grid in found if not _differ(strips, grid, found[0])), key=_likelihood)
+    second = max((grid for grid in found if _differ(strips, grid, found[0])), key=_likelihood, default=None)
+    return [best] if second is None or _likelihood(second) < _NEARLY_BEST * _likelihood(best) else [best, second]
+
+
+def _likelihood(grid: Grid) -> float:
+    """Log-likelihood of a grid with its borders in their place."""
+    return grid.explained + grid.contrast
 
 
 def _score(grid: Grid) -> float:

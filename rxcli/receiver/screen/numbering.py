@@ -29,6 +29,9 @@ _SURE, _BRIGHT, _BLACK, _LIT_ROWS = 4.0, 90, 4.0, 0.2
 _GREY_LEVEL, _MAX_STEADY = 255.0**-2, 2.0
 #: Mean light of parts that belong to the light; columns of the picture that must lie beyond light which ends in it.
 _ENDS, _IN_VIEW = 0.15, 0.3
+#: Parts are faint up to this share of the way from the darkest to the brightest (percentile), of the root of light;
+#: standard deviations of a plain difference between the means beside a border, and their minimum, of white.
+_DARK, _FAINT, _PLAIN_EDGE, _MIN_FAINT_SD = 10, 0.05, 4.0, 0.0004
 #: Distances from the screen's middle, screen widths, within which edges lie that it has in pairs: of films and of the
 #: screen's frame.
 _PAIRED = (0.22, 0.58)
@@ -45,6 +48,7 @@ class _Weights(msgspec.Struct, frozen=True):
     hidden_unlit: float
     columns_on_border: float
     light_on_border: float
+    faint_on_border: float
     paired_edges: float
 
 
@@ -58,7 +62,7 @@ WEIGHTS = _Weights.__struct_fields__
 
 @lru_cache(maxsize=1)
 def numbering_weights() -> FloatArray:
-    """(9,) the shipped weights, in the order of the features."""
+    """(10,) the shipped weights, in the order of the features."""
     path = data_dir("models") / "numbering" / "model.toml"
     model = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _Model)
     return np.array(msgspec.structs.astuple(model.weights))
@@ -76,6 +80,9 @@ class LightProfile:
     level: FloatArray
     #: (P,) log-odds that a part has light that never goes out.
     steady: FloatArray
+    #: (P,) whether a part has hardly any light, and its level, scaled so that a difference of one in total is plain.
+    is_faint: BoolArray
+    faint: FloatArray
     #: Column at the picture's middle.
     picture_middle: float
 
@@ -93,10 +100,11 @@ class LightProfile:
         left = float(self.place[0]) - 0.5 / _PARTS
         return left + start / _PARTS, left + end / _PARTS
 
-    def edges(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(P + 1,) 0..1: how much values (P,) rise, and fall, at a border of parts or beside it."""
+    def edges(self, values: FloatArray, known: BoolArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """(P + 1,) 0..1: how much values (P,) rise, and fall, at a border of known parts or beside it."""
         step, middle = 2 * _BESIDE, slice(_BESIDE, -_BESIDE)
-        shown, total = (np.concatenate([[0.0], np.cumsum(part)]) for part in (self.in_picture, values))
+        known = self.in_picture if known is None else known
+        shown, total = (np.concatenate([[0.0], np.cumsum(part)]) for part in (known, values))
         steps = np.zeros(total.size)
         steps[middle] = (total[step:] - 2 * total[middle] + total[:-step]) * (shown[step:] - shown[:-step] == step)
         return _at_or_beside(np.clip(steps, 0, 1)), _at_or_beside(np.clip(-steps, 0, 1))
@@ -124,15 +132,30 @@ def light_profile(strips: PictureStrips, light: Float32Array, grid: Grid) -> Lig
     by_rows = light.mean(axis=(1, 2)).reshape(strips.n_parts, -1).mean(axis=0)
     lit = np.tile(by_rows >= _LIT_ROWS * by_rows.max(), strips.n_parts)[:, None].astype(np.float64)
     n_lit = np.maximum(total(lit), 1)
+    shown = total(lit) > 0
+    is_faint, faint = _faint_light(total(lit * np.sqrt(np.maximum(strips.level, 0))) / n_lit, shown)
     level = np.log(total(lit * strips.level) / n_lit + _GREY_LEVEL)
     darkest = total(lit * np.log(strips.darkest + _GREY_LEVEL)) / n_lit
-    shown = total(lit) > 0
     level = np.clip(1 + (level - np.percentile(level[shown], _BRIGHT)) / _BLACK, 0, 1) * shown
     of_columns = darkest[shown & (coherent > 0.5)]
     usual = np.median(of_columns) if of_columns.size else np.inf
     steady = np.clip(darkest - usual, 0, _MAX_STEADY) * (1 - coherent) * shown
     place = origin + (np.arange(n) + 0.5) / _PARTS
-    return LightProfile(place, count > 0, coherent, level, steady, float(grid.coefficients[0]))
+    return LightProfile(place, count > 0, coherent, level, steady, is_faint, faint, float(grid.coefficients[0]))
+
+
+def _faint_light(root: FloatArray, shown: BoolArray) -> tuple[BoolArray, FloatArray]:
+    """`is_faint` and `faint` of parts with the root (P,) of their light: a panel that is dark passes a little.
+
+    The screen's frame, and the room around it, mostly differ from that. Neighbouring parts give the noise.
+    """
+    darkest, brightest = np.percentile(root[shown], (_DARK, 100 - _DARK / 2))
+    is_faint = shown & (root < darkest + _FAINT * (brightest - darkest))
+    beside = np.abs(np.diff(root))[is_faint[1:] & is_faint[:-1]]
+    # Of normal differences the median is 0.95 standard deviations of one part.
+    sd = max(float(np.median(beside)) / 0.95 if beside.size else np.inf, _MIN_FAINT_SD)
+    plain = _PLAIN_EDGE * sd * np.sqrt(2 * _BESIDE)
+    return is_faint, np.where(is_faint, root, 0) / plain
 
 
 def first_columns(light: LightProfile, n_columns: int) -> tuple[IntArray, FloatArray, bool]:
@@ -146,7 +169,7 @@ def first_columns(light: LightProfile, n_columns: int) -> tuple[IntArray, FloatA
 
 
 def first_column_features(light: LightProfile, n_columns: int) -> tuple[IntArray, FloatArray, bool]:
-    """Columns (F,) of a grid, their features (F, 9) in the order of the weights, and whether no side is in view."""
+    """Columns (F,) of a grid, their features (F, 10) in the order of the weights, and whether no side is in view."""
     shown = light.place[light.in_picture]
     left, right = float(shown.min()), float(shown.max())
     starts = np.arange(int(left) - n_columns + 3, int(right) - 2)
@@ -159,6 +182,7 @@ def first_column_features(light: LightProfile, n_columns: int) -> tuple[IntArray
     hidden = np.maximum(np.stack([left - starts, ends - right]), 0.0)
     rises, falls = light.edges(light.level)
     begins, ceases = light.edges(light.coherent)
+    brightens, fades = light.edges(light.faint, light.is_faint)
     border, width = ((starts - light.place[0]) * _PARTS + 0.5).round().astype(np.int64), n_columns * _PARTS
     # Light that goes on outside the picture has its middle anywhere.
     off_middle = np.abs(np.array([[(begin + end_of_light) / 2], [light.picture_middle]]) - middles) / n_columns
@@ -170,6 +194,7 @@ def first_column_features(light: LightProfile, n_columns: int) -> tuple[IntArray
         ~reaches @ hidden > _IN_VIEW,
         _at(begins, border) + _at(ceases, border + width),
         _at(rises, border) + _at(falls, border + width),
+        _at(brightens, border) + _at(fades, border + width),
         _paired(rises, falls, border + width // 2, width),
     )
     return starts, np.stack(terms, axis=1).astype(np.float64), bool(reaches.all())

@@ -25,6 +25,7 @@ from rxcli.receiver.screen.find import (
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
 from rxcli.receiver.screen.numbering import (
     LightProfile,
+    _faint_light,
     first_column_features,
     first_columns,
     light_profile,
@@ -300,7 +301,7 @@ def test_a_second_grid_is_proposed_where_it_does_nearly_as_well(monkeypatch: pyt
     assert np.abs(off[0]).max() < 0.2 < np.abs(off[1]).max()
 
 
-def test_narrower_columns_that_explain_more_light_but_stand_out_less_lose(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_narrower_columns_that_explain_more_but_stand_out_less_come_second(monkeypatch: pytest.MonkeyPatch) -> None:
     strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
     rivals = [replace(true, coefficients=true.coefficients * np.array([1, share, 1, 1, 1, 1])) for share in (1, 1.2)]
     lights = {grid.pitch_px: light for grid, light in zip(rivals, ((34090, 2948), (35973, 2634)), strict=True)}
@@ -312,8 +313,7 @@ def test_narrower_columns_that_explain_more_light_but_stand_out_less_lose(monkey
     monkeypatch.setattr(find, "find_combs", lambda *_: [])
     monkeypatch.setattr(find, "moved_by_waveforms", lambda _, grid, *__: grid)
     monkeypatch.setattr(find, "with_light", lit)
-    (chosen,) = wide_grids(strips, 0.45, rivals)
-    assert chosen.pitch_px == true.pitch_px
+    assert [grid.pitch_px for grid in wide_grids(strips, 0.45, rivals)] == [grid.pitch_px for grid in rivals]
 
 
 def test_one_grid_over_a_dark_gap_is_one_screen(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -354,7 +354,8 @@ def profile(start: float, end: float, *, film: tuple[float, float] | None = None
     place = (np.arange(-16, right * 8) + 0.5) / 8
     coherent = ((place > start) & (place < end)).astype(np.float64)
     level = coherent if film is None else ((place > film[0]) & (place < film[1])).astype(np.float64)
-    return LightProfile(place, np.ones(place.size, bool), coherent, level, np.zeros(place.size), 10.0)
+    none = np.zeros(place.size)
+    return LightProfile(place, np.ones(place.size, bool), coherent, level, none, none > 0, none, 10.0)
 
 
 @pytest.mark.parametrize("film", [(2.75, 17.25), (2.5, 16.25)])
@@ -365,8 +366,25 @@ def test_bars_of_equal_width_on_both_sides_show_the_first_column(film: tuple[flo
     assert is_plain == (sum(film) == 20)
 
 
+@pytest.mark.parametrize("first", [-1, 0, 1])
+def test_the_little_light_that_a_dark_panel_passes_shows_the_first_column(first: int) -> None:
+    light = profile(7, 13)
+    inside = (light.place > first) & (light.place < first + 20)
+    columns, log_odds, _ = first_columns(replace(light, is_faint=light.coherent == 0, faint=0.4 * inside), 20)
+    assert columns[log_odds.argmax()] == first
+
+
+@pytest.mark.parametrize(("step", "is_plain"), [(1.5, True), (0.1, False)])
+def test_faint_light_is_measured_by_its_own_noise(step: float, is_plain: bool) -> None:
+    rng, places = np.random.default_rng(3), np.arange(160)
+    root = (10 + rng.normal(0, 0.3, 160) + step * (places > 40)) / 255 + 0.7 * (places > 90)
+    is_faint, faint = _faint_light(root, places >= 0)
+    assert np.array_equal(is_faint, places <= 90)
+    assert (faint[41:44].sum() - faint[38:41].sum() > 0.75) == is_plain
+
+
 def test_steady_light_around_the_screen_shows_the_first_column() -> None:
-    dark, lighted = (find_outlines(drawn("dark sides", room=room), [WIDE]) for room in (0.0, 30.0))
+    dark, lighted = (find_outlines(drawn("dark sides", room=room), [WIDE]) for room in (0.0, 45.0))
     certainty = [
         1 / np.exp([one.log_odds - candidates[0].log_odds for one in candidates]).sum()
         for candidates in (dark, lighted)
