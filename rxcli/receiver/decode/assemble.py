@@ -137,7 +137,8 @@ def _burst(frame: FrameColumns, shown: _Shown, quality: Quality) -> _Burst:
     copies = n_observed.sum(axis=1) / clock.packet_slots
     rows = _header_rows(int((clock.burst == shown.index).argmax()), clock)
     payloads = _payloads(posteriors.index[place], posteriors.w)
-    framing = 1.0 if frame.framing is None else float(frame.framing[shown.index])
+    # A sum of probabilities may be rounded to more than 1.
+    framing = 1.0 if frame.framing is None else min(float(frame.framing[shown.index]), 1.0)
     packets = [
         PacketResult(
             first_row=first_row,

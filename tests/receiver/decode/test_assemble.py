@@ -323,3 +323,18 @@ def test_a_packet_of_a_clip_that_misses_a_slot_is_not_whole() -> None:
     assert not first.packets
     assert "of 50 slots 1 are missing" in (first.message or "")
     assert second.packets
+
+
+def test_a_probability_that_was_rounded_up_is_one() -> None:
+    clock, posteriors = clock_of(60, 0, [0, 0]), posteriors_of([5, 5], indices([5, 5]))
+    burst = confidence.BurstInClip(0, 0, posteriors, np.ones((2, 50), np.int64), (3,), None, np.zeros(2, np.float32))
+    packets = [
+        assemble.clip_results(
+            assemble.FrameColumns(clock, snr(60), np.zeros(2, bool), 0.0, framing=np.array([framing])),
+            [burst],
+            lambda _: False,
+        )[0].packets
+        for framing in (1.0, 1.001)
+    ]
+    assert packets[0]
+    assert packets[0] == packets[1]
