@@ -53,9 +53,14 @@ class Located:
         return self.found.best.evidence if isinstance(self.found, Found) else 0.0
 
     @property
+    def is_long(self) -> bool:
+        """Whether packets of a long exposure were found."""
+        return isinstance(self.found, Found) and self.found.best.reception.is_long
+
+    @property
     def is_open(self) -> bool:
         """Whether there are no packets that settle the outline; those of long exposures show on many outlines."""
-        return not isinstance(self.found, Found) or self.found.best.reception.is_long
+        return not isinstance(self.found, Found) or self.is_long
 
     @property
     def is_plain(self) -> bool:
@@ -124,20 +129,25 @@ class ClipCamera:
         return Located(found.outline, context, found, framing)
 
     def locate_again(self, cache: FrameCache, outline: Outline | None, corners: FloatArray | None) -> Located | Failure:
-        """The same of a screen that was lost, which is where it was unless packets of a short exposure contradict.
+        """The same of a screen that was lost: where it was, or anywhere if that shows more packets.
+
+        Packets of a long exposure show on many outlines, so that it is taken to be where it was.
 
         Args:
             cache: the frame.
-            outline: where a long exposure showed the screen; None: nothing is known.
+            outline: where the screen was found; None: nothing is known.
             corners: (4, 2) of the screen in the last frame that showed it.
         """
         if outline is None or corners is None:
             return self.locate(cache)
         there = self.locate(cache, [replace(outline, corners=corners, strips=None, grid=None)])
-        if isinstance(there, Located) and there.evidence:
+        if isinstance(there, Located) and there.is_long:
             return there
         anywhere = self.locate(cache)
-        return there if isinstance(anywhere, Failure) or anywhere.is_open else anywhere
+        here = there.evidence if isinstance(there, Located) else 0.0
+        if isinstance(anywhere, Located) and anywhere.evidence > here and not anywhere.is_long:
+            return anywhere
+        return there
 
     def locate_in_changes(self, cache: FrameCache, following: Frame) -> Located | Failure | None:
         """The same by what changed from a frame to the following one; None where that shows no screen."""

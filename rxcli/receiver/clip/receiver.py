@@ -65,7 +65,7 @@ class Known:
     camera: ClipCamera
     #: (4, 2) of the screen in the last frame that showed it.
     corners: FloatArray | None = None
-    #: Where the screen was found last, if by a long exposure.
+    #: Where the screen was found last.
     outline: Outline | None = None
     #: The last frame.
     frame: Frame | None = None
@@ -267,7 +267,7 @@ def _receive_anew(
         return Lost(known), Failure("no_signal", STEADY_LIGHT), None
     if assemble.all_dark(reception.snr):
         return Lost(known), Failure("no_signal", _NOTHING_LIT), None
-    known = replace(known, outline=located.outline if reception.is_long else None)
+    known = replace(known, outline=located.outline)
     view = View(
         acquired.context,
         acquisition,
