@@ -53,6 +53,17 @@ def box_sums(values: Float32Array, half: int) -> Float32Array:
     return np.asarray(summed, np.float32).reshape(values.shape)
 
 
+def mean_of_valid(values: Float32Array, valid: Float32Array, half: int) -> Float32Array:
+    """Mean over the valid samples at most `half` away along the last axis, 0 where there are none; same shape.
+
+    Args:
+        values: 0 where not valid.
+        valid: 1 or 0.
+        half: samples to each side.
+    """
+    return np.asarray(box_sums(values, half) / np.maximum(box_sums(valid, half), 1), np.float32)
+
+
 def local_mean(values: Float32Array, window: int) -> Float32Array:
     """Mean over a window of (at least) `window` samples, mirrored at the ends; (n, samples), same shape."""
     import cv2

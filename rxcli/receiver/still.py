@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import ReceiverError
-from rxcli.numerics import box_sums
+from rxcli.numerics import mean_of_valid
 from rxcli.options import ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel
@@ -196,12 +196,13 @@ def _joint_samples(
     clock, columns = acquisition.clock, np.arange(len(acquisition.profiles.light))
     samples = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
     bursts = ratios.burst_samples(samples, clock, model.black_level, model.noise, model.crosstalk, columns, lit)
-    return samples, _with_weights(bursts, w_log_prob)
+    return samples, _with_weights(bursts, w_log_prob, np.full((bursts.n_bursts, 1, 1), STILL.min_weight_log_prior))
 
 
-def _with_weights(bursts: BurstSamples, w_log_prob: FloatArray) -> BurstSamples:
-    prior = np.maximum(w_log_prob, STILL.min_weight_log_prior) / bursts.n_bursts
-    return replace(bursts, w_log_prior=np.tile(prior, (bursts.n_bursts, 1)))
+def _with_weights(bursts: BurstSamples, w_log_prob: FloatArray, least: FloatArray) -> BurstSamples:
+    """Bursts whose paths begin with the weights' log probability (C, 9), by burst and column no less than `least`."""
+    prior = np.maximum(w_log_prob, least) / bursts.n_bursts
+    return replace(bursts, w_log_prior=prior.reshape(-1, len(WEIGHTS)))
 
 
 def lateness(acquisition: Acquisition, model: channel.ObservationModel, w_log_prob: FloatArray, step: float) -> float:
@@ -222,10 +223,9 @@ def _joint_snr(
 ) -> Float32Array:
     """(C, N) squared contrast of a slot over its noise, of the light on average."""
     q = samples.samples_per_slot
-    around = SLOTS_PER_SYMBOL * q
-    mean = box_sums(light, around) / np.maximum(box_sums(samples.valid, around), 1)
+    mean = mean_of_valid(light, samples.valid, SLOTS_PER_SYMBOL * q)
     contrast = 2 * np.maximum(mean, 0) * model.crosstalk.own / np.float32(max(clock.exposure_slots, 1.0))
-    ratio = contrast**2 / model.noise.variance(np.asarray(mean, np.float32)) * samples.valid
+    ratio = contrast**2 / model.noise.variance(mean) * samples.valid
     return np.asarray(ratio[..., q // 2 :: q].sum(axis=1) * np.float32(survivor_settings.information))
 
 
@@ -248,8 +248,7 @@ def follow_picture(acquisition: Acquisition, reception: Reception, columns: NDAr
         # Paths that see nothing of a packet's start would keep the weights of fewest words.
         dimming = reception.n_observed[:, columns, SLOTS_PER_SYMBOL:PREAMBLE_SLOTS].sum(axis=2, keepdims=True)
         least = np.where(dimming > 0, STILL.min_weight_log_prior, STILL.no_weight)
-        prior = np.maximum(reception.posteriors.w_log_prob[columns], least) / bursts.n_bursts
-        bursts = replace(bursts, w_log_prior=prior.reshape(-1, len(WEIGHTS)))
+        bursts = _with_weights(bursts, reception.posteriors.w_log_prob[columns], least)
     found = survivors.detect(bursts)
     header_llr, log_prob = reception.posteriors.header_llr[:, columns], found.log_prob
     if reception.is_long:  # Where arbitrary slots explain a column as well, it may have no packets.

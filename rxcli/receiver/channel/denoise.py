@@ -26,7 +26,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from rxcli.errors import ProfileError
-from rxcli.numerics import NORMAL_MEDIAN, TINY, box_sums
+from rxcli.numerics import NORMAL_MEDIAN, TINY, mean_of_valid
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
@@ -145,7 +145,7 @@ def _strip_features(scene: DenoiserInput, observed: _Residuals, columns: NDArray
     """(B, S, 26, N) features of strips, see `STRIP_FEATURES`."""
     q, sigma = scene.samples.samples_per_slot, np.float32(max(scene.model.noise.sigma, TINY))
     valid, light, expected = scene.samples.valid[columns], observed.light, observed.expected
-    level = _local_level(light, valid, q)
+    level = np.maximum(mean_of_valid(light, valid, SLOTS_PER_SYMBOL * q), 0)
     base = np.float32(0.02) * level + 2 * sigma
     middle = scene.model.crosstalk.against_middle()
     # The network was trained on light relative to the column's centre.
@@ -208,12 +208,6 @@ def _pooled(values: NDArray[np.floating[Any]], q: int) -> Float32Array:
     return np.asarray(
         values.sum(axis=1).reshape(values.shape[0], -1, q).sum(axis=2) * np.float32(SETTINGS.slot_information / q)
     )
-
-
-def _local_level(light: Float32Array, valid: Float32Array, q: int) -> Float32Array:
-    """(B, S, n) local mean light of the valid samples."""
-    around = SLOTS_PER_SYMBOL * q
-    return np.maximum(box_sums(light, around) / np.maximum(box_sums(valid, around), 1), 0)
 
 
 def _noise_features(level: Float32Array, sigma: np.float32, shot_gain: np.float32) -> tuple[Float32Array, Float32Array]:

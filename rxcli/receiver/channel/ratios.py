@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import box_sums
+from rxcli.numerics import mean_of_valid
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.receiver.light import Crosstalk, NoiseModel, exposed_from
@@ -42,10 +42,7 @@ def burst_samples(
     """
     q = samples.samples_per_slot
     above = (samples.light - np.float32(black_level)) * samples.valid
-    around = SLOTS_PER_SYMBOL * q
-    mean = samples.level
-    if mean is None:
-        mean = np.asarray(box_sums(above, around) / np.maximum(box_sums(samples.valid, around), 1), np.float32)
+    mean = mean_of_valid(above, samples.valid, SLOTS_PER_SYMBOL * q) if samples.level is None else samples.level
     mean = np.maximum(mean, np.float32(SETTINGS.min_level_sigmas * noise.sigma))
     light = np.asarray(above / mean, np.float32)
     ahead = np.diff(clock.delay_slots) * q if clock.delay_slots.any() else None

@@ -36,7 +36,7 @@ class FirstFrames:
     #: Corners (4, 2) that were found in each frame, carried back to the first, less those found there.
     differences: tuple[FloatArray, ...]
     #: Whether the screen was found in what changed from the first to the second.
-    is_cancelled: bool = False
+    is_in_changes: bool = False
 
     @classmethod
     def begin(cls, frame: Frame, camera: ClipCamera) -> FirstFrames | Failure:
@@ -47,10 +47,12 @@ class FirstFrames:
     @classmethod
     def in_changes(cls, frame: Frame, following: Frame, camera: ClipCamera) -> FirstFrames | None:
         """Search the first frame by what changed from it to the next; None where that shows no screen."""
-        located = camera.locate_in_changes(FrameCache(frame), following)
-        if located is None or isinstance(located, Failure):
+        cache = FrameCache(frame)
+        outlines = screen_in_changes(cache, following, camera.options)
+        located = camera.locate(cache, outlines) if outlines else None
+        if not isinstance(located, Located):
             return None
-        return replace(cls._at(frame, camera, located), is_cancelled=True)
+        return replace(cls._at(frame, camera, located), is_in_changes=True)
 
     @classmethod
     def _at(cls, frame: Frame, camera: ClipCamera, located: Located) -> FirstFrames:
@@ -84,19 +86,19 @@ class FirstFrames:
     def with_frame(self, frame: Frame, camera: ClipCamera) -> FirstFrames:
         """These frames and one more; it is searched for its outline and its camera as far as they are unsure."""
         is_first = len(self.frames) == 1
-        if is_first and self.texture is not None and not (self.is_cancelled or self.located.is_plain):
+        if is_first and self.texture is not None and not (self.is_in_changes or self.located.is_plain):
             by_changes = FirstFrames.in_changes(self.frames[0], frame, camera)
             if by_changes is not None and (self.located.is_open or by_changes.located.evidence > self.located.evidence):
                 return by_changes.with_frame(frame, camera)
-        outlines = [self.located.outline] if self.is_cancelled else None
+        outlines = [self.located.outline] if self.is_in_changes else None
         longer, located, found = replace(self, frames=(*self.frames, frame)), self.located, None
         unsure = located.camera_error == np.inf or (located.camera_error > 0 and self.shows_little)
         if unsure or not (self._agree or located.is_plain):
             found = (camera if unsure else replace(camera, context=located.context)).locate(FrameCache(frame), outlines)
             longer = replace(longer, located=located.with_surer_camera(found) if unsure else located)
-        if self._agree or (self.is_cancelled and is_first):
+        if self._agree or (self.is_in_changes and is_first):
             return longer
-        if self.is_cancelled:
+        if self.is_in_changes:
             changes = screen_in_changes(FrameCache(self.frames[-1]), frame, camera.options)
             return longer._compared(self.frames[-1], changes[0] if changes else None)
         return longer._compared(frame, None if found is None else found.outline, is_followed=found is None)

@@ -88,14 +88,15 @@ def bursts_of(view: View) -> list[Burst]:
     assert view.numbers is not None
     own = view.bursts
     metrics, shows_payload = channel.by_burst(own.metrics, own.clock), own.shown[..., PREAMBLE_SLOTS:].any(axis=(1, 2))
-    is_joint = view.joint is not None and np.array_equal(view.joint.burst, own.clock.burst)
+    # Copies that were detected together under another assignment count by themselves.
+    joint = view.joint if view.joint and np.array_equal(view.joint.burst, own.clock.burst) else None
     bursts = []
     for index, number in enumerate(view.numbers.tolist()):
         which = own.clock.burst == index
         copies, n_observed = own.first_copy + np.flatnonzero(which & shows_payload), own.shown[which].sum(axis=0)
         evidence = metrics[index]
-        if is_joint and view.joint is not None:
-            evidence = channel.metrics_of(llr_of(view.joint.lit[index]) * (n_observed > 0), view.isi_memory)
+        if joint is not None:
+            evidence = channel.metrics_of(llr_of(joint.lit[index]) * (n_observed > 0), view.isi_memory)
         bursts.append(Burst(number, evidence, n_observed, (own.frame,), copies, own.tracked))
     return bursts
 

@@ -16,7 +16,7 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.screen.outline import Outline
-from rxcli.receiver.search import Found, screen_in_changes, search
+from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.settings import SETTINGS as search_settings
 from rxcli.receiver.still import initial_pass
@@ -148,11 +148,6 @@ class ClipCamera:
         if isinstance(anywhere, Located) and anywhere.evidence > here and not anywhere.is_long:
             return anywhere
         return there
-
-    def locate_in_changes(self, cache: FrameCache, following: Frame) -> Located | Failure | None:
-        """The same by what changed from a frame to the following one; None where that shows no screen."""
-        outlines = screen_in_changes(cache, following, self.options)
-        return self.locate(cache, outlines) if outlines else None
 
     def acquire(
         self, located: Located, start: Start | None, cache: FrameCache

@@ -112,7 +112,7 @@ class TrackedScreen:
             return None
         if clock.exposure_slots > LONG_EXPOSURE_SLOTS:
             bursts, observed = timeline.assigned(frame, clock), _Observed(pose.rows, light, columns, 1)
-            return self._long_view(cache, observed, picture, (clock, bursts), max_misfit)
+            return self._long_view(cache, observed, picture, clock, bursts, max_misfit)
         with timer("detect"):
             positions = known_picture.row_positions(pose.rows, clock)
             lit = known_picture.first_decision(columns, positions, clock)
@@ -139,16 +139,17 @@ class TrackedScreen:
         cache: FrameCache,
         observed: _Observed,
         picture: PlacedPicture,
-        predicted: tuple[Clock, IntArray | None],
+        clock: Clock,
+        bursts: IntArray | None,
         max_misfit: float,
     ) -> View | None:
         """Receive a frame whose rows show several slots: slots and what is not known of the picture, jointly.
 
-        `predicted` are its clock and, once known, the bursts of its copies.
+        `clock` is the predicted one, and `bursts` are those of its copies once they are known.
         """
         assert self.last is not None
         assert self.last.joint is not None
-        pose, frame, (clock, bursts) = self.pose, cache.frame, predicted
+        pose, frame = self.pose, cache.frame
         with cache.timer("detect"):
             acquisition = self._acquired(observed.light, pose, picture, clock)
             model, weights = self._model(clock), self.last.joint.w_log_prob

@@ -101,8 +101,7 @@ class Timeline:
         slot = self.time.predict(frame.index, frame.time_s)
         if slot is None or not self.phase.settled:
             return None
-        first_copy = round((slot - clock.first_slot + clock.row0 / clock.rows_per_slot) / clock.packet_slots)
-        bursts = self.phase.burst_of(first_copy + np.arange(clock.n_copies))
+        bursts = self.phase.burst_of(self.time.first_copy(slot, clock) + np.arange(clock.n_copies))
         return np.asarray(bursts - bursts[0], np.int64)
 
     def certainty(self, copies: IntArray) -> float:

@@ -67,17 +67,21 @@ class LinkTime:
             return slot + self._period * self._frames_since(number, frame, time_s - at_s)
         return slot + (time_s - at_s) * self.slot_rate_hz
 
+    def first_copy(self, slot: float, clock: Clock) -> int:
+        """Number of a clock's copy 0 where sensor row 0 is nearest to a predicted `slot`."""
+        return round((slot - _slot_of_row_0(clock)) / self.packet_slots)
+
     def update(self, frame: int, time_s: float, clock: Clock) -> int | None:
         """Enter the clock of a frame; return the number of its copy 0, or None if it contradicts the link time.
 
         `time_s` is the frame's time stamp.
         """
-        inside = clock.first_slot - clock.row0 / clock.rows_per_slot
+        inside = _slot_of_row_0(clock)
         predicted = self.predict(frame, time_s)
         if predicted is None:
             first_copy, slot = 0, inside
         else:
-            first_copy = round((predicted - inside) / self.packet_slots)
+            first_copy = self.first_copy(predicted, clock)
             slot = inside + first_copy * self.packet_slots
             if self._period is not None and abs(slot - predicted) > SETTINGS.max_jump_slots:
                 return None
@@ -157,6 +161,11 @@ class LinkTime:
         self._period = (
             period if self._period is None else self._period + SETTINGS.period_share * (period - self._period)
         )
+
+
+def _slot_of_row_0(clock: Clock) -> float:
+    """From the start of copy 0."""
+    return clock.first_slot - clock.row0 / clock.rows_per_slot
 
 
 def _line(x: FloatArray, y: FloatArray) -> tuple[float, float]:
