@@ -1,9 +1,8 @@
 """The comb of column borders: the correlation of two nearby strips is lowest if a border lies between them.
 
-Let the light spread of a column be a Gaussian of `sigma` column pitches. Strips at `u` and `u + d` (in columns) then
-correlate as the vectors `exp(-(u - k)^2 / 2 sigma^2)` over the columns k. Along the screen this correlation oscillates
-with a period of one column, most strongly for `d` of about 0.7. A Fourier sum over all pairs at about that distance
-finds the period. It needs no edge of the screen and no decoding.
+Along the screen, the correlation of strips at a distance of `d` columns oscillates about its mean with a period of one
+column, most strongly for `d` of about 0.7. A Fourier sum over all pairs at about that distance finds the period. It
+needs no edge of the screen, no light spread and no decoding.
 """
 
 from __future__ import annotations
@@ -53,24 +52,10 @@ class Comb:
         return abs(self.pitch - comb.pitch) < _SAME_PITCH and shape * self.pitch < _SAME_SHAPE
 
 
-@lru_cache
-def likeness(sigma: float, distance: float) -> float:
-    """Mean over the phase of the correlation of two positions `distance` columns apart."""
-    middle, centres = np.linspace(0, 1, 64, endpoint=False), np.arange(-6, 8) + 0.5
-    left, right = (np.exp(-((middle[:, None] + s * distance / 2 - centres) ** 2) / (2 * sigma**2)) for s in (-1, 1))
-    cosine = (left * right).sum(-1) / np.sqrt((left**2).sum(-1) * (right**2).sum(-1))
-    return float(cosine.mean())
-
-
-def find_combs(strips: PictureStrips, sigma: float) -> list[Comb]:
-    """The strongest combs, strongest first; none if the strongest may be chance.
-
-    Args:
-        strips: of the picture or of a part of it.
-        sigma: light spread of the screen, column pitches.
-    """
+def find_combs(strips: PictureStrips) -> list[Comb]:
+    """The strongest combs of a picture or of a part of it, strongest first; none if the strongest may be chance."""
     chosen: list[Comb] = []
-    for comb in sorted(_all_combs(strips.without_common_light(), sigma), key=lambda comb: -comb.score):
+    for comb in sorted(_all_combs(strips.without_common_light()), key=lambda comb: -comb.score):
         if not any(comb.is_like(earlier) for earlier in chosen):
             chosen.append(comb)
         if len(chosen) == _N_COMBS or chosen[0].score <= _MIN_COMB:
@@ -89,7 +74,7 @@ def grid_of_comb(comb: Comb, strips: PictureStrips) -> Grid:
     return grid_through(grid, x, y, comb.phase + comb.pitch * bent)
 
 
-def _all_combs(strips: PictureStrips, sigma: float) -> list[Comb]:
+def _all_combs(strips: PictureStrips) -> list[Comb]:
     """The best comb of each pitch."""
     step = strips.step * strips.n_parts
     max_pitch = min(_MAX_PITCH, 1 / (_MIN_COLUMN_STRIPS * step))
@@ -100,8 +85,9 @@ def _all_combs(strips: PictureStrips, sigma: float) -> list[Comb]:
     for distance in np.unique(distances).tolist():
         lit_pairs = strips.coherence[:, :-distance] * strips.coherence[:, distance:]
         tried = pitches[distances == distance]
-        mean = likeness(sigma, round(float(tried.mean()) * distance * step, 2))
-        rest = np.sqrt(lit_pairs) * strips.coherence_at(distance) - np.float32(mean) * lit_pairs
+        rest = np.sqrt(lit_pairs) * strips.coherence_at(distance)
+        # Where light spreads far, pairs have more in common; taken off too little, it looks like few wide columns.
+        rest -= np.vdot(rest, lit_pairs) / (np.vdot(lit_pairs, lit_pairs) + np.float32(TINY)) * lit_pairs
         chance = np.sqrt(float(lit_pairs.sum()) / (2 * strips.n_rows)) + TINY
         # Pairs across a border are less coherent. Combs are scaled to their standard deviation by chance, so that
         # different distances can be compared.

@@ -196,11 +196,12 @@ def wide_grids(strips: PictureStrips, sigma: float, rivals: Sequence[Grid] = (),
         rivals: grids that compete with those of the combs, unless the strongest comb's is plain.
         least: minimum contrast, times what chance gives.
     """
-    some, combs = strips.blocks(slice(None, None, 2)), find_combs(strips, sigma)
+    some, combs = strips.blocks(slice(None, None, 2)), find_combs(strips)
     starts = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[:1]]
     if not starts or starts[0].contrast < _PLAIN_CONTRAST * starts[0].explained:
         starts += [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
-        starts = sorted(starts, key=_score, reverse=True)[:_N_FITTED]
+        # Contrast needs borders that are in their place already.
+        starts = sorted(starts, key=_likelihood, reverse=True)[:_N_FITTED]
         starts += [rival for rival in rivals if with_light(some, rival, sigma).contrast > 0]
     near = [moved_by_waveforms(some, grid, sigma, _FIRST_STEPS) for grid in starts]
     fitted = [with_light(strips, moved_by_waveforms(strips, grid, sigma, _LAST_STEPS), sigma) for grid in near]
@@ -233,7 +234,7 @@ def narrow_grid(strips: PictureStrips, sigma: float) -> Grid | None:
     """The grid of narrow columns, or None: parts of the picture are searched, and a clear grid is followed outwards."""
     some, few = (strips.blocks(slice(None, None, step)) for step in (2, 4))
     for part in sorted(range(strips.n_parts), key=lambda part: abs(part - strips.n_parts // 2)):
-        for comb in find_combs(strips.part(part), sigma)[:1]:
+        for comb in find_combs(strips.part(part))[:1]:
             own = few.part(part)
             grid = moved_by_waveforms(own, grid_of_comb(comb, strips.part(part)), sigma, _FIRST_STEPS)
             is_block = abs(grid.pitch_px - _BLOCK_PX) < _BLOCK_TOLERANCE_PX

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rxcli.receiver.plane import read_plane
 from rxcli.receiver.screen import find, geometry
-from rxcli.receiver.screen.combs import find_combs, likeness
+from rxcli.receiver.screen.combs import find_combs
 from rxcli.receiver.screen.find import (
     ColumnLayout,
     find_screens,
@@ -316,6 +316,23 @@ def test_narrower_columns_that_explain_more_but_stand_out_less_come_second(monke
     assert [grid.pitch_px for grid in wide_grids(strips, 0.45, rivals)] == [grid.pitch_px for grid in rivals]
 
 
+def test_combs_are_fitted_by_their_likelihood_as_borders_out_of_place_stand_out_little(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    starts = [replace(true, coefficients=true.coefficients * np.array([1, 1 / n, 1, 1, 1, 1])) for n in (1, 2, 3, 4)]
+
+    def lit(_: PictureStrips, grid: Grid, __: float) -> Grid:
+        pitch, is_moved = grid.coefficients[1], not any(grid is start for start in starts)
+        return replace(grid, explained=2000 * pitch, contrast=300 * pitch if is_moved else 1000 / pitch)
+
+    monkeypatch.setattr(find, "find_combs", lambda _: starts)
+    monkeypatch.setattr(find, "grid_of_comb", lambda comb, _: comb)
+    monkeypatch.setattr(find, "moved_by_waveforms", lambda _, grid, *__: replace(grid))
+    monkeypatch.setattr(find, "with_light", lit)
+    assert wide_grids(strips, 0.45)[0].pitch_px == pytest.approx(true.pitch_px)
+
+
 def test_one_grid_over_a_dark_gap_is_one_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     plane, n_strips = drawn("gap"), read_strips(drawn("gap")).coherence.shape[1]
 
@@ -390,7 +407,7 @@ def test_steady_light_around_the_screen_shows_the_first_column() -> None:
         for candidates in (dark, lighted)
     ]
     assert round(float(np.median(apart(lighted[0])))) == 0
-    assert certainty[0] < 0.9 < 0.95 < certainty[1]
+    assert certainty[0] < 0.7 < 0.9 < certainty[1]
 
 
 def test_light_that_ends_just_before_the_edge_of_the_picture_ends_on_the_screen() -> None:
@@ -414,13 +431,10 @@ def test_light_ends_where_bars_begin_and_takes_no_more_than_a_screen() -> None:
     assert bottom - top == pytest.approx(1, abs=0.02)
 
 
-@pytest.mark.parametrize("distance", [0.5, 0.72, 1.2])
-def test_likeness_is_the_mean_cosine_of_two_places_light(distance: float) -> None:
-    k, cosines = np.arange(-8, 9) + 0.5, []
-    for u in np.arange(0, 1, 0.05):
-        one, other = (np.exp(-((u + side * distance / 2 - k) ** 2) / (2 * 0.45**2)) for side in (-1, 1))
-        cosines.append(one @ other / np.sqrt((one @ one) * (other @ other)))
-    assert likeness(0.45, distance) == pytest.approx(np.mean(cosines), abs=0.01)
+@pytest.mark.parametrize("picture", ["white", "fading"])
+def test_the_strongest_comb_is_the_columns_and_not_that_of_the_light(picture: str) -> None:
+    pitch = grid_between(CORNERS, 20, (WIDTH, HEIGHT), None).coefficients[1]
+    assert find_combs(read_strips(drawn(picture)))[0].pitch == pytest.approx(pitch, rel=0.06)
 
 
 def test_coherence_of_independent_strips_is_chance() -> None:
@@ -429,7 +443,7 @@ def test_coherence_of_independent_strips_is_chance() -> None:
     pairs = strips.coherence_at(7)
     assert abs(float(pairs.mean())) < 0.01
     assert float(pairs.std()) == pytest.approx(strips.n_rows**-0.5, rel=0.3)
-    assert not [comb for comb in find_combs(strips, 0.45) if comb.score > 7]
+    assert not [comb for comb in find_combs(strips) if comb.score > 7]
 
 
 @lru_cache(maxsize=1)
@@ -561,7 +575,7 @@ def test_a_tall_picture_takes_little_memory_or_is_refused() -> None:
     assert "360 x 6000 pixels, more than 6 times as high" in str(why_useless(noise[:, ::2], 0, 255))
     strips = read_strips(read_plane(Frame(noise[:4300], "memory")))
     tracemalloc.start()
-    find_combs(strips, WIDE.sigma)
+    find_combs(strips)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 20e6
