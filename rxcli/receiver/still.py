@@ -444,8 +444,10 @@ def detected(metrics: FloatArray, clock: Clock, weight_margin: float = SETTINGS.
 def _light_model(acquisition: Acquisition, clock: Clock, samples: SlotSamples) -> channel.ObservationModel:
     profiles = acquisition.profiles
     rows = _rows_per_sample(clock, samples.samples_per_slot)
-    black_level = channel.estimate_black_level(samples, clock)
     min_sigma = 0.5 * noise_of(profiles) / rows**0.5
+    black_level = channel.estimate_black_level(samples, clock)
+    if black_level is None:
+        black_level = _darkest(samples, min_sigma)
     sigma = dark_sigma(samples.light, samples.valid, black_level, min_sigma)
     return channel.ObservationModel(
         black_level=black_level,
@@ -453,6 +455,15 @@ def _light_model(acquisition: Acquisition, clock: Clock, samples: SlotSamples) -
         crosstalk=Crosstalk.of(samples.light.shape[1], acquisition.screen.light_spread),
         exposure=Exposure.of(clock.exposure_slots, samples.samples_per_slot),
     )
+
+
+def _darkest(samples: SlotSamples, sigma: float) -> float:
+    """The light of a dark slot where no header is in view: of what is dark in a column and in those beside it."""
+    pooled, _ = sync.contrast(samples.light, samples.valid, samples.samples_per_slot, sigma)
+    is_dark = np.pad(pooled < STILL.dark_contrast, ((1, 1), (0, 0)), constant_values=True)
+    is_dark = is_dark[1:-1] & is_dark[:-2] & is_dark[2:]
+    shown = samples.light[is_dark[:, None] & (samples.valid > 0)]
+    return float(np.percentile(shown, STILL.dark_quarter)) if shown.size else 0.0
 
 
 def _rows_per_sample(clock: Clock, samples_per_slot: int) -> float:

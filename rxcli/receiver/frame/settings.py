@@ -30,6 +30,10 @@ class StillSettings:
     coarse_samples: int = 2
     #: Fewest rows per slot of a joint detection.
     min_joint_rows: float = 2.0
+    #: Black level where no header is in view: contrast up to which light is dark, -1 dark to 1 lit; and the percentile
+    #: of such light, as some of it is lit in part.
+    dark_contrast: float = -0.7
+    dark_quarter: float = 25
     #: Black level of a long exposure, as a share of a percentile of the light.
     dark_share: float = 0.95
     dark_percent: float = 0.5

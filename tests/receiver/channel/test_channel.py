@@ -229,7 +229,7 @@ def hostile(kind: str, samples: SlotSamples) -> SlotSamples:
 def test_hostile_light_gives_finite_likelihoods(kind: str, is_initial: bool, idea: float) -> None:
     _, now, samples, _ = scene(Shot(), seed=7)
     samples = hostile(kind, samples)
-    black_level = channel.estimate_black_level(samples, now)
+    black_level = channel.estimate_black_level(samples, now) or 0.0
     sigma = dark_sigma(samples.light, samples.valid, black_level, 1e-5)
     model = model_for(Shot(), sigma, black_level)
     lit = np.full((6, now.n_slots), idea, np.float32)

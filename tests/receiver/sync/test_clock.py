@@ -41,7 +41,7 @@ def received(
 ) -> tuple[Clock, BurstPosteriors, SlotSamples]:
     """Light model and detection in turn, the clock corrected after each."""
     samples = sync.sample_slots(profiles, clock_, Q)
-    floor = channel.estimate_black_level(samples, clock_)
+    floor = channel.estimate_black_level(samples, clock_) or 0.0
     model = channel.ObservationModel(
         black_level=floor,
         noise=NoiseModel(dark_sigma(samples.light, samples.valid, floor, 1e-4) ** 2, 0.0),
