@@ -1,7 +1,5 @@
 """A headless Chromium for tests, driven by its own protocol: pages, files chosen, pictures, what the console said."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json
@@ -10,7 +8,7 @@ import subprocess
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import aiohttp
 
@@ -35,7 +33,7 @@ class Browser:
         self.complaints: list[str] = []
         self._answers: dict[int, asyncio.Future[Any]] = {}
 
-    async def __aenter__(self) -> Browser:
+    async def __aenter__(self) -> Self:
         self._home = tempfile.TemporaryDirectory(prefix="chromium-", ignore_cleanup_errors=True)
         assert CHROMIUM is not None
         command = [CHROMIUM, *_FLAGS, f"--user-data-dir={self._home.name}", "about:blank"]

@@ -1,7 +1,5 @@
 """A receiver without pictures: text files say what becomes of them. Its own module, so that workers import it."""
 
-from __future__ import annotations
-
 import json
 import os
 import random

@@ -1,7 +1,5 @@
 """Small files of every kind, written for the tests of the readers."""
 
-from __future__ import annotations
-
 import struct
 from fractions import Fraction
 from pathlib import Path

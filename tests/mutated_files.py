@@ -8,8 +8,6 @@ reports a line each; a case that takes too long, or too much memory, ends the pr
 seed makes the same case.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import io

@@ -1,7 +1,5 @@
 """Stills as real cameras and programs write them: files that are not as their standards ask, of one picture each."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """Row profiles of a link whose every slot is known, made without a picture; its own equations, not the receiver's."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

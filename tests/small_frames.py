@@ -1,7 +1,5 @@
 """Small pictures of a screen with ten columns, for tests of what is around the receiver: they decode in no time."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

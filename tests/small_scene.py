@@ -1,7 +1,5 @@
 """A small, easy scene of the simulator: short packets, two of them in a frame, no distortion."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

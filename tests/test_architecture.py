@@ -1,7 +1,5 @@
 """The directions in which modules may import one another, held by walking the source."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Every block of code in README and docs does what a reader would do with it: it runs, and Python is typed."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil

@@ -1,7 +1,5 @@
 """Exit codes and what an error says; where shipped data lie."""
 
-from __future__ import annotations
-
 import pickle
 
 import pytest

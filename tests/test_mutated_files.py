@@ -1,7 +1,5 @@
 """The program that mutates files: the same seed makes the same case, and what goes wrong is named by its seed."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 

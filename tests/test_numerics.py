@@ -1,7 +1,5 @@
 """Maths that stages share, against what it is short for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

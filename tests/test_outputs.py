@@ -1,7 +1,5 @@
 """Outputs never destroy: what would be lost is refused before anything is opened; what is written is whole."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import io

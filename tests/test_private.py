@@ -1,7 +1,5 @@
 """A decode opens no socket of the internet family and writes no file but its outputs, whatever it reads."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import shutil

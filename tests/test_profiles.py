@@ -1,7 +1,5 @@
 """Profiles: shipped ones load, anything wrong is named, what is written is read back; `vlc-rx profiles`."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The air interface against literal values of its specification."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from math import comb
 

@@ -1,7 +1,5 @@
 """`import rxcli`: cheap, complete, and the same receiver as the command line's."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The vocabulary of names and prose: the glossary's terms are used, and words that a reader stumbles over are not."""
 
-from __future__ import annotations
-
 import ast
 import io
 import re

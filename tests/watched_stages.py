@@ -1,7 +1,5 @@
 """Watches the numeric stages: every value that a public function of theirs returns is checked."""
 
-from __future__ import annotations
-
 import inspect
 import warnings
 from collections.abc import Callable, Iterator

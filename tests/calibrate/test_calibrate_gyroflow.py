@@ -1,7 +1,5 @@
 """Gyroflow's fisheye profiles as OpenCV's pinhole model, against OpenCV's own fisheye; readouts that cannot be."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Lens models from boards: known lenses are found again, bad pictures are named, what is missing is said."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

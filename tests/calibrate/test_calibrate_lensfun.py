@@ -1,7 +1,5 @@
 """Lensfun's polynomials as OpenCV coefficients, against the polynomials themselves and against the database."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

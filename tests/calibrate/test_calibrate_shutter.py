@@ -1,7 +1,5 @@
 """Line delay from blinking lamps: waveforms, regions, several lamps, refusals, intervals that hold."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

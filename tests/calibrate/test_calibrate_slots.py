@@ -1,7 +1,5 @@
 """Line delay from a screen that sends data: known line delays are found again, refusals."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

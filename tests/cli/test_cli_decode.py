@@ -1,7 +1,5 @@
 """`vlc-rx decode` from end to end: small pictures in, tables, lines, files and exit codes out."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

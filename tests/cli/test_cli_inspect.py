@@ -1,7 +1,5 @@
 """`vlc-rx inspect`: the page, and what is drawn on it."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re

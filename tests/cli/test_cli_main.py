@@ -1,7 +1,5 @@
 """The group of commands: help, version, and errors as one line with an exit code."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """How a run ends is told: exit codes, summaries and journals of runs that are interrupted, refused or cannot write."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import json

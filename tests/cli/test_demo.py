@@ -1,7 +1,5 @@
 """`vlc-rx demo`: from nothing to a text and the page that shows how it was read."""
 
-from __future__ import annotations
-
 import webbrowser
 from pathlib import Path
 

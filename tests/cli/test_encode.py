@@ -1,7 +1,5 @@
 """`vlc-rx encode`, and texts and files through `simulate` and `decode`."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re

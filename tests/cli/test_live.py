@@ -1,12 +1,9 @@
-"""Live cameras, through the system calls of a real V4L2 device that umockdev answers for a fake one."""
-
-from __future__ import annotations
+"""Live cameras, whose system calls a fake one answers."""
 
 import errno
 import json
 import os
 import pty
-import signal
 import subprocess
 import sys
 import termios
@@ -18,7 +15,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from fake_camera import VLC_RX, Bench, environment, needs_umockdev
+from commands import ENVIRONMENT
+from fake_camera import Bench
 
 from rxcli.cli.live import Status, format_status
 from rxcli.cli.main import run
@@ -31,14 +29,13 @@ from rxcli.results.report import wrapped
 from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
 
 WIDTH, HEIGHT, N_FRAMES = 96, 64, 10
+UNPLUGGED = "vlc-rx: /dev/video0: the camera was unplugged; plug it in again"
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
     rows = np.random.default_rng(11).integers(0, 256, (8, HEIGHT, 1), dtype=np.uint8)
-    found = Bench(tmp_path, np.repeat(rows, WIDTH, axis=2))
-    found.add_jpegs()
-    return found
+    return Bench(tmp_path, np.repeat(rows, WIDTH, axis=2), monkeypatch)
 
 
 FORMATS = [
@@ -52,143 +49,140 @@ FORMATS = [
 ]
 
 
-@needs_umockdev
-class TestFormats:
-    @pytest.mark.parametrize(("name", "shift", "black", "white"), FORMATS, ids=[form[0] for form in FORMATS])
-    def test_luma_arrives_as_sent(self, bench: Bench, name: str, shift: int, black: float, white: float) -> None:
-        seen = bench.client({"pixel_format": name})
-        assert (seen["error"], len(seen["frames"])) == (None, N_FRAMES)
-        sent = bench.luma[:, :, 0].astype(int) << shift
-        for frame in seen["frames"]:
-            error = np.abs(sent - np.array(frame["rows"])).max(axis=1).min()
-            assert error <= (2 if name == "MJPG" else 0)
-            assert (frame["levels"], frame["model"]) == ([black, white], "Fake camera")
-            assert frame["dtype"] == ("uint16" if shift else "uint8")
-        assert bench.state()["format"].strip() == name
-
-    def test_times_are_those_of_the_sensor(self, bench: Bench) -> None:
-        times = [frame["time_s"] for frame in bench.client({"pixel_format": "GREY"}, n_frames=20)["frames"]]
-        steps = np.diff(times) * 60
-        assert times[0] == 0
-        np.testing.assert_allclose(steps, np.rint(steps), atol=0.01)
-        assert (steps > 0.5).all()
-
-    def test_best_format_is_taken_and_another_refused(self, bench: Bench) -> None:
-        assert bench.client({}, 1)["mode"].startswith("Y16 96 x 64")
-        assert bench.client({}, 1, formats=["YUYV", "MJPG"])["mode"].startswith("YUYV")
-        seen = bench.client({"width": 640}, 1)
-        assert (
-            "/dev/video0: does not offer any format 640 x any; it offers GREY 96 x 64 at 60 frames/s" in seen["error"]
-        )
-        seen = bench.client({"pixel_format": "YUYV"}, 1, faults={"force_format": "GREY"})
-        assert seen["error"] == "/dev/video0: gives GREY instead of YUYV; ask for another --format"
+@pytest.mark.parametrize(("name", "shift", "black", "white"), FORMATS, ids=[form[0] for form in FORMATS])
+def test_luma_arrives_as_sent(bench: Bench, name: str, shift: int, black: float, white: float) -> None:
+    seen = bench.read({"pixel_format": name})
+    assert (seen.error, len(seen.frames)) == (None, N_FRAMES)
+    sent = bench.luma.astype(int) << shift
+    for frame in seen.frames:
+        assert np.abs(sent - frame.pixels).max(axis=(1, 2)).min() <= (2 if name == "MJPG" else 0)
+        assert (frame.black, frame.white, frame.metadata.model) == (black, white, "Fake camera")
+        assert frame.pixels.dtype == ("uint16" if shift else "uint8")
+    assert bench.camera.format.strip() == name
 
 
-@needs_umockdev
+def test_times_are_those_of_the_sensor(bench: Bench) -> None:
+    times = [frame.time_s for frame in bench.read({"pixel_format": "GREY"}, n_frames=20).frames]
+    steps = np.diff(times) * 60
+    assert times[0] == 0
+    np.testing.assert_allclose(steps, np.rint(steps), atol=0.01)
+    assert (steps > 0.5).all()
+
+
+def test_best_format_is_taken_and_another_refused(bench: Bench) -> None:
+    assert bench.read({}, 1).mode.startswith("Y16 96 x 64")
+    assert bench.read({}, 1, formats=["YUYV", "MJPG"]).mode.startswith("YUYV")
+    reason = "/dev/video0: does not offer any format 640 x any; it offers GREY 96 x 64 at 60 frames/s"
+    assert reason in bench.read({"width": 640}, 1).error
+    seen = bench.read({"pixel_format": "YUYV"}, 1, faults={"force_format": "GREY"})
+    assert seen.error == "/dev/video0: gives GREY instead of YUYV; ask for another --format"
+
+
 @pytest.mark.parametrize(
     ("asked", "exposure_s", "controls"),
     [  # manual exposure, its value, gain, automatic gain; a constant frame rate, and gain as it was
-        ({}, 1e-4, {"0x9a0901": 1, "0x9a0902": 1, "0x9a0903": 0, "0x980913": 16}),
-        ({"exposure_s": 0.002, "gain": 99}, 0.002, {"0x9a0902": 20, "0x980913": 99, "0x980912": 0}),
+        ({}, 1e-4, {0x9A0901: 1, 0x9A0902: 1, 0x9A0903: 0, 0x980913: 16}),
+        ({"exposure_s": 0.002, "gain": 99}, 0.002, {0x9A0902: 20, 0x980913: 99, 0x980912: 0}),
     ],
 )
 def test_exposure_and_gain_as_asked(
-    asked: dict[str, Any], exposure_s: float, controls: dict[str, int], bench: Bench
+    asked: dict[str, Any], exposure_s: float, controls: dict[int, int], bench: Bench
 ) -> None:
-    assert bench.client(asked, 1)["frames"][0]["exposure_s"] == pytest.approx(exposure_s)
-    assert bench.state()["controls"].items() >= controls.items()
+    assert bench.read(asked, 1).frames[0].metadata.exposure_s == pytest.approx(exposure_s)
+    assert bench.camera.controls.items() >= controls.items()
 
 
-@needs_umockdev
-class TestFaults:
-    def test_slow_receiver_gets_the_newest_and_a_count(self, bench: Bench) -> None:
-        seen = bench.client({"pixel_format": "GREY"}, n_frames=6, pause_s=0.1)
-        sensor_frames = round(seen["frames"][-1]["time_s"] * 60)
-        assert sensor_frames > 20
-        assert seen["dropped"] >= sensor_frames - 5 - 2  # some may come after the last that was taken
-        assert np.diff([frame["time_s"] for frame in seen["frames"]]).min() > 0.05
-
-    def test_waits_for_a_camera_that_comes_back(self, bench: Bench) -> None:
-        seen = bench.client({"wait": True}, faults={"unplug_after": 4, "return_s": 0.3})
-        assert (seen["error"], seen["connections"], len(seen["waited"])) == (None, 2, 1)
-        assert [frame["index"] for frame in seen["frames"]] == list(range(N_FRAMES))
-        times = [frame["time_s"] for frame in seen["frames"]]
-        assert times == sorted(times)
-
-    def test_busy(self, bench: Bench) -> None:
-        error = bench.client({}, faults={"busy_s": 100})["error"]
-        assert error.startswith("/dev/video0: another program uses the camera; close it")
-        seen = bench.client({"wait": True}, 2, faults={"busy_s": 1})
-        assert (seen["error"], len(seen["frames"]), len(seen["waited"])) == (None, 2, 1)
-
-    def test_silent_or_damaged(self, bench: Bench) -> None:
-        seen = bench.client({"stall_s": 0.3}, faults={"stall_after": 3})
-        assert 1 <= len(seen["frames"]) <= 3
-        assert "the camera sent nothing for 0.3 s" in seen["error"]
-        for faults in ({"damage_every": 3}, {"short_every": 3}):
-            seen = bench.client({"pixel_format": "GREY"}, faults=faults)
-            assert len(seen["frames"]) == N_FRAMES
-            assert seen["damaged"] >= 4
-
-    @pytest.mark.parametrize("pace", [0, -1])
-    def test_times_that_do_not_advance_are_counted_in_frames(self, bench: Bench, pace: float) -> None:
-        seen = bench.client({"pixel_format": "GREY"}, pause_s=0.05, faults={"stamp_pace": pace})["frames"]
-        assert [frame["nominal_time"] for frame in seen] == [False, *[True] * (N_FRAMES - 1)]
-        steps = np.diff([frame["time_s"] for frame in seen]) * 60
-        np.testing.assert_allclose(steps, np.rint(steps), atol=0.01)
-        assert (steps > 1.5).all()  # some frames passed in each pause
-
-    def test_a_port_without_room(self, bench: Bench) -> None:
-        error = bench.client({}, 1, faults={"stream_error": errno.ENOSPC})["error"]
-        assert error.startswith("/dev/video0: its USB port has no room left for this mode; lower --width")
+def test_slow_receiver_gets_the_newest_and_a_count(bench: Bench) -> None:
+    seen = bench.read({"pixel_format": "GREY"}, n_frames=6, pause_s=0.1)
+    sensor_frames = round(seen.frames[-1].time_s * 60)
+    assert sensor_frames > 20
+    assert seen.counts.dropped >= sensor_frames - 5 - 2  # some may come after the last that was taken
+    assert np.diff([frame.time_s for frame in seen.frames]).min() > 0.05
 
 
-@needs_umockdev
-class TestCommand:
-    def test_modes(self, bench: Bench) -> None:
-        done = bench.vlc_rx("live", "/dev/video0", "--list")
-        assert (done.returncode, done.stdout.splitlines()[0]) == (ExitCode.OK, "Y16 96 x 64 at 60 frames/s")
-
-    def test_unplugged(self, bench: Bench) -> None:
-        done = bench.vlc_rx("live", "/dev/video0", "--json", "-", faults={"unplug_after": 5})
-        assert done.returncode == ExitCode.UNREADABLE
-        ending = "the camera was unplugged; plug it in again; --wait waits for it"
-        assert done.stderr.splitlines()[-1] == f"vlc-rx: /dev/video0: {ending}"
-        assert all(json.loads(line)["status"] != "ok" for line in done.stdout.splitlines())
-
-    def test_nothing_received(self, bench: Bench, tmp_path: Path) -> None:
-        done = bench.vlc_rx("live", "/dev/video0", "--json", str(tmp_path / "o.jsonl"), "--frames", "3")
-        assert done.returncode == ExitCode.NOT_RECEIVED
-        assert [json.loads(line)["frame"] for line in (tmp_path / "o.jsonl").read_text().splitlines()] == [0, 1, 2]
-        assert "columns 0/0" in done.stderr
-
-    @pytest.mark.parametrize("faults", [{}, {"busy_s": 100}, {"stall_after": 0}, {"damage_every": 1}], ids=str)
-    def test_duration_counts_from_the_start_whatever_comes(self, bench: Bench, faults: dict[str, int]) -> None:
-        """A camera that is busy, sends nothing, or nothing whole: without a duration it would be waited for."""
-        quiet = [] if "damage_every" in faults else ["--quiet"]
-        done = bench.vlc_rx("live", "/dev/video0", "--wait", "--duration", "0.5", *quiet, faults=faults)
-        assert (done.returncode, done.stdout) == (ExitCode.NOT_RECEIVED, ""), done.stderr
-        if not quiet:
-            last = done.stderr.splitlines()[-1]
-            assert last.startswith("no whole frame yet | dropped ")
-            assert int(last.rpartition(" ")[2]) > 0
-
-    def test_interrupt(self, bench: Bench) -> None:
-        command = bench.command(*VLC_RX, "live", "/dev/video0")
-        process = subprocess.Popen(
-            command, stderr=subprocess.PIPE, text=True, env=environment(), start_new_session=True
-        )
-        assert process.stderr is not None
-        assert "columns 0/0" in process.stderr.readline()
-        os.killpg(process.pid, signal.SIGINT)
-        rest = process.communicate(timeout=30)[1]
-        assert process.returncode == ExitCode.INTERRUPTED
-        assert rest.splitlines()[-1] == "vlc-rx: interrupted"
-        assert "Traceback" not in rest
+def test_a_camera_that_comes_back_is_waited_for(bench: Bench) -> None:
+    seen = bench.read({"wait": True}, faults={"unplug_after": 4, "return_s": 0.3})
+    assert (seen.error, seen.counts.connections, len(seen.waited)) == (None, 2, 1)
+    assert [frame.index for frame in seen.frames] == list(range(N_FRAMES))
+    times = [frame.time_s for frame in seen.frames]
+    assert times == sorted(times)
+    seen = bench.read({"wait": True}, 2, faults={"busy_s": 1})
+    assert (seen.error, len(seen.frames), len(seen.waited)) == (None, 2, 1)
 
 
-@needs_umockdev
-def test_payloads_of_a_simulated_screen(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("faults", "reason"),
+    [
+        ({"busy_s": 100}, "/dev/video0: another program uses the camera; close it"),
+        ({"stall_after": 3}, "/dev/video0: the camera sent nothing for 0.3 s"),
+        ({"stream_error": errno.ENOSPC}, "/dev/video0: its USB port has no room left for this mode; lower --width"),
+    ],
+)
+def test_a_camera_that_cannot_be_read_says_why(bench: Bench, faults: dict[str, int], reason: str) -> None:
+    seen = bench.read({"stall_s": 0.3}, faults=faults)
+    assert seen.error.startswith(reason)
+    assert len(seen.frames) <= faults.get("stall_after", 0)
+
+
+@pytest.mark.parametrize("fault", ["damage_every", "short_every"])
+def test_damaged_frames_are_left_out_and_counted(bench: Bench, fault: str) -> None:
+    seen = bench.read({"pixel_format": "GREY"}, faults={fault: 3})
+    assert len(seen.frames) == N_FRAMES
+    assert seen.counts.damaged >= 4
+
+
+@pytest.mark.parametrize("pace", [0, -1])
+def test_times_that_do_not_advance_are_counted_in_frames(bench: Bench, pace: float) -> None:
+    frames = bench.read({"pixel_format": "GREY"}, pause_s=0.05, faults={"stamp_pace": pace}).frames
+    assert [frame.nominal_time for frame in frames] == [False, *[True] * (N_FRAMES - 1)]
+    steps = np.diff([frame.time_s for frame in frames]) * 60
+    np.testing.assert_allclose(steps, np.rint(steps), atol=0.01)
+    assert (steps > 1.5).all()  # some frames passed in each pause
+
+
+@pytest.mark.parametrize(
+    ("arguments", "faults", "code", "last"),
+    [
+        (["--json", "-"], {"unplug_after": 5}, ExitCode.UNREADABLE, f"{UNPLUGGED}; --wait waits for it"),
+        (["--frames", "3"], {}, ExitCode.NOT_RECEIVED, "no signal | columns 0/0"),
+        ([], {"interrupt_after": 5}, ExitCode.INTERRUPTED, "vlc-rx: interrupted"),
+        # A camera that is busy, sends nothing, or nothing whole: a duration counts from the start, whatever comes.
+        *(
+            (["--wait", "--duration", "0.5", "--quiet"], faults, ExitCode.NOT_RECEIVED, "")
+            for faults in ({}, {"busy_s": 100}, {"stall_after": 0})
+        ),
+        (["--duration", "0.5"], {"damage_every": 1}, ExitCode.NOT_RECEIVED, "no whole frame yet | dropped "),
+    ],
+)
+def test_how_the_command_ends(
+    bench: Bench,
+    arguments: list[str],
+    faults: dict[str, int],
+    code: ExitCode,
+    last: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    bench.plug_in(faults=faults)
+    assert run(["live", "/dev/video0", *arguments]) == code
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines() or [""]
+    assert lines[-1].startswith(last)
+    assert "Traceback" not in captured.err
+    statuses = [json.loads(line)["status"] for line in captured.out.splitlines()]
+    assert bool(statuses) == ("--json" in arguments)
+    assert "ok" not in statuses
+    if "damage_every" in faults:
+        assert int(lines[-1].rpartition(" ")[2]) > 0
+
+
+def test_modes_are_listed(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["live", "/dev/video0", "--list"]) == ExitCode.OK
+    assert capsys.readouterr().out.splitlines()[0] == "Y16 96 x 64 at 60 frames/s"
+
+
+def test_payloads_of_a_simulated_screen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Simulated frames go through the system calls of a camera, and their payloads come out.
 
     The camera shows one picture over and over, and the second frame is left out: it is the one before once more.
@@ -202,21 +196,24 @@ def test_payloads_of_a_simulated_screen(tmp_path: Path) -> None:
     sent = ["--payload", f"hex:{payload.hex()}", "--start-slot", "40"]
     assert run(["simulate", str(clip), *scene, *sent]) == ExitCode.OK
     truth = json.loads((tmp_path / "clip.truth.json").read_text())
-    bench = Bench(tmp_path, np.stack([frame.pixels for frame in open_source(clip)]))
+    Bench(tmp_path, np.stack([frame.pixels for frame in open_source(clip)]), monkeypatch)
     known = [f"{x},{y}" for x, y in truth["corners_sensor_px"]]
     receiver = ["--screen", str(screen), "--camera", "xs10", "--corners", *known]
-    done = bench.vlc_rx("live", "/dev/video0", "--format", "GREY", "--frames", "2", "--json", "-", *receiver)
-    assert done.returncode == ExitCode.OK, done.stderr
-    assert "LOCKED" in done.stderr
+    capsys.readouterr()
+    out = tmp_path / "o.jsonl"
+    assert run(["live", "/dev/video0", "--format", "GREY", "--frames", "2", "--json", str(out), *receiver]) == 0
+    assert "LOCKED" in capsys.readouterr().err
+    records = [json.loads(line) for line in out.read_text().splitlines()]
     right = [
         packet["payload"] == payload[7 * column["column"] :][:7].hex()
-        for line in done.stdout.splitlines()
-        for column in json.loads(line)["columns"]
+        for record in records
+        for column in record["columns"]
         for packet in column["packets"]
     ]
     assert len(right) >= 18  # one a column
     assert np.mean(right) > 0.95
-    assert json.loads(done.stdout.splitlines()[1])["skipped"] == {"doubled_frames": 1}
+    assert [record["frame"] for record in records] == [0, 1]
+    assert records[1]["skipped"] == {"doubled_frames": 1}
 
 
 @pytest.mark.parametrize(
@@ -279,8 +276,8 @@ class TestStatus:
             "        _print_above('payload'); status.update(result('ok', 20)); time.sleep(0.25)\n"
         )
         shown, here = bytearray(), Path(__file__).parent
-        paths = os.pathsep.join([environment()["PYTHONPATH"], str(here), str(here.parent)])
-        told = environment() | {"COLUMNS": "100", "NO_COLOR": "1", "PYTHONPATH": paths}
+        paths = os.pathsep.join([ENVIRONMENT["PYTHONPATH"], str(here), str(here.parent)])
+        told = ENVIRONMENT | {"COLUMNS": "100", "NO_COLOR": "1", "PYTHONPATH": paths}
         leader, follower = pty.openpty()
         termios.tcsetwinsize(follower, (24, 100))
         with subprocess.Popen([sys.executable, "-c", code], stdout=follower, stderr=follower, env=told) as started:

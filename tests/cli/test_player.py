@@ -1,7 +1,5 @@
 """The program in docs/transmitter.md plays what `encode` wrote: in an emulator of the chip, and on the host."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

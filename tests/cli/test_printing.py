@@ -1,7 +1,5 @@
 """What `decode` shows: texts and files first, a clip in one line, and progress that tells the end."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

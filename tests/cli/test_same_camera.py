@@ -1,7 +1,5 @@
 """Photos by one camera share what is estimated of it, when told so and on the page."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 """What is no input, would fill the memory, or claims what cannot be: one line with file, reason and next step; never
 another exception, never a warning."""
 
-from __future__ import annotations
-
 import logging
 import os
 import random

@@ -1,7 +1,5 @@
 """Pictures of every kind: luma as stored, levels, metadata, orientation."""
 
-from __future__ import annotations
-
 import io
 import struct
 from pathlib import Path

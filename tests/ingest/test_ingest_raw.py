@@ -1,7 +1,5 @@
 """RAW files: the sensor's mosaic, its crop, pattern, levels and gains; nothing demosaiced, nothing turned."""
 
-from __future__ import annotations
-
 import gc
 import struct
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Clips: luma planes, levels, times, orientation, and what is left of a clip that breaks off."""
 
-from __future__ import annotations
-
 import gc
 from pathlib import Path
 from typing import Any

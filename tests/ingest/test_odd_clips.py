@@ -1,7 +1,5 @@
 """Clips as cameras, recorders and programs write them, not as the book says: every whole frame, and no other."""
 
-from __future__ import annotations
-
 import struct
 import sys
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Stills that are not as their standards ask are read as plain files of the same pixels; damage is still reported."""
 
-from __future__ import annotations
-
 import io
 import lzma
 import struct

@@ -1,7 +1,5 @@
 """Frames read ahead: the same ones in the same order, and whoever brings them is told when nobody takes them."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Generator
 from contextlib import closing

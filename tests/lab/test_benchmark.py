@@ -1,7 +1,5 @@
 """The benchmark: ways to receive, the runner and its journal, measures, tables, and the commands."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """What the benchmark draws: as asked for, the same for the same seed, and as in earlier versions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

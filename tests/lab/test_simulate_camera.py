@@ -1,7 +1,5 @@
 """Optics, shutter and sensor of the simulator against closed forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

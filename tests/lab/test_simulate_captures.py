@@ -1,7 +1,5 @@
 """Files, truth, bound and command line of the simulator."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,7 +1,5 @@
 """A camera in a hand: its turns, its speed, and rows that are read while it moves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

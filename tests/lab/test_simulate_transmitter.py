@@ -1,7 +1,5 @@
 """The transmitter against closed forms and the air interface's own numbers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hostile values that must not upset the receiver: frames, outlines, exposures, damaged arrays, detector inputs."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor

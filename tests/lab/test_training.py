@@ -1,7 +1,5 @@
 """Training: data with right labels, seeded and resumable fitting, export that computes what torch computes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

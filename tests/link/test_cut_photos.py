@@ -1,7 +1,5 @@
 """Texts of photographs that show a part of a packet and no header: the code finds which part."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

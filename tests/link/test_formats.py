@@ -1,7 +1,5 @@
 """Bodies, announcements, containers and names: what is taken and what is refused."""
 
-from __future__ import annotations
-
 import hashlib
 import struct
 import zlib

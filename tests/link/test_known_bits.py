@@ -1,7 +1,5 @@
 """Bits of a message that are known before it is decoded: zeros after it, and the letters of a text."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Codes: parity, erasures, noise, and that chance is not taken for a codeword."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

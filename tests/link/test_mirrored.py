@@ -1,7 +1,5 @@
 """Column numbers that a picture leaves open, shifted or mirrored: texts and files decide, or a user knows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Soft bits to messages and files: over whole transfers, from anywhere, and from what is no transfer at all."""
 
-from __future__ import annotations
-
 import struct
 import tracemalloc
 from collections.abc import Iterable, Iterator

@@ -1,7 +1,5 @@
 """The values that any implementation must give, from an independent one."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import zlib

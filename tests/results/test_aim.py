@@ -1,7 +1,5 @@
 """Aiming: who follows the hints of a live camera has the screen after three of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

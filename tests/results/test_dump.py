@@ -1,7 +1,5 @@
 """Taps: what `--dump-dir` writes of photographs and of the frames of clips."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

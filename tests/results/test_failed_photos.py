@@ -1,7 +1,5 @@
 """Photos that cannot be received say why and what to do: on the terminal, on the page of `serve`, and on inspect's."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The map of coherent strips with the grid of columns, on pictures drawn here."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

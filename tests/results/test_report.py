@@ -1,7 +1,5 @@
 """JSON lines, tables, summaries and JUnit files."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

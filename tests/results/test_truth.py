@@ -1,7 +1,5 @@
 """Scoring against the truth: the definitions, by hand-made packets."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Batches: which files, in which order, by whom, and what a kill leaves behind."""
 
-from __future__ import annotations
-
 import json
 import os
 from contextlib import closing

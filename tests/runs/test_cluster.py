@@ -1,7 +1,5 @@
 """A real Dask scheduler with two worker processes on the loopback interface."""
 
-from __future__ import annotations
-
 import gc
 import json
 import os

@@ -1,7 +1,5 @@
 """A folder as people have them: photos, RAW files and clips, some of them bad, and a run that is killed and resumed."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os

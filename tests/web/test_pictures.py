@@ -3,8 +3,6 @@
 `VLC_RX_PICTURES=docs/pictures pytest tests/web/test_pictures.py` writes those of the documentation.
 """
 
-from __future__ import annotations
-
 import asyncio
 import io
 import os

@@ -1,7 +1,5 @@
 """The page's server: what it answers, who may ask, what it costs; and the page itself in a browser."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import contextlib
@@ -35,7 +33,8 @@ pytest.importorskip("segno")
 
 import aiohttp
 from browser import CHROMIUM, Browser
-from fake_camera import VLC_RX, Bench, environment, needs_umockdev
+from commands import COMMAND, ENVIRONMENT
+from fake_camera import Bench
 from PIL import Image
 
 from rxcli.cli.main import run
@@ -338,9 +337,9 @@ def test_odd_requests_are_refused_without_a_word(
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT, signal.SIGKILL])
 def test_no_upload_is_left_however_the_server_ends(number: int, tmp_path: Path) -> None:
     """While an upload arrives, whose sender does not go away."""
-    command = [*VLC_RX, "serve", "--port", "0"]
+    command = [*COMMAND, "serve", "--port", "0"]
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-    told = environment() | {"TMPDIR": str(tmp_path)}
+    told = ENVIRONMENT | {"TMPDIR": str(tmp_path)}
     with subprocess.Popen(command, env=told, start_new_session=True, **pipes) as server:
         assert server.stdout is not None
         port = int(server.stdout.readline().decode().rsplit(":", 1)[1].strip("/\n"))
@@ -535,6 +534,41 @@ def test_a_live_camera_gives_state_picture_and_packets(passed_s: float, monkeypa
     json.dumps(events)
 
 
+def in_a_thread(work: Callable[..., None], *arguments: Any) -> tuple[Any, Any]:
+    """In place of `start_process`: it sees the fake camera."""
+    ours, theirs = multiprocessing.Pipe()
+
+    def run_it() -> None:
+        with contextlib.suppress(OSError):
+            work(theirs, *arguments)
+
+    threading.Thread(target=run_it, daemon=True).start()
+    return SimpleNamespace(kill=theirs.close, join=int, exitcode=0), ours
+
+
+def test_the_live_page_is_told_when_the_camera_sees_the_screen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clip = np.stack([frame.pixels for frame in open_source(CLIP)])
+    blank = np.full((20, *clip.shape[1:]), 24, np.uint8)
+    Bench(tmp_path, np.concatenate([blank, *[clip] * 5]), monkeypatch, formats=["NV12"], fps=15.0)
+    monkeypatch.setattr("rxcli.web.live.start_process", in_a_thread)
+    monkeypatch.setattr("rxcli.web.live.signal", SimpleNamespace(signal=max, SIGINT=0, SIG_IGN=0))
+
+    async def work(server: Server, client: Any) -> None:
+        advice = []
+        async with client.get(server.address + "live", timeout=aiohttp.ClientTimeout(60)) as answer:
+            assert answer.content_type == "text/event-stream"
+            async for line in answer.content:
+                if line.startswith(b'data: {"'):
+                    event = json.loads(line[6:])
+                    advice.append(event["state"]["reason"] + event["state"]["advice"])
+                    if event["state"]["locked"] and event["packets"]:
+                        break
+        assert "The picture is too dark." in advice[0]
+        assert len(event["picture"]["outlines"]) == 20
+
+    serving(Site(receiver_options(cameras=(VIDEO_CAMERA,)), port=0, device=Path("/dev/video0")), work)
+
+
 # -- in a browser -----------------------------------------------------------------------------------------------------
 
 
@@ -654,30 +688,3 @@ _CONTRAST = """(() => {
   const ground = light(getComputedStyle(node).backgroundColor);
   return (Math.max(ink, ground) + 0.05) / (Math.min(ink, ground) + 0.05);
 })()"""
-
-
-@needs_chromium
-@needs_umockdev
-def test_the_live_page_locks_on_the_camera(tmp_path: Path) -> None:
-    clip = np.stack([frame.pixels for frame in open_source(CLIP)])
-    blank = np.full((20, *clip.shape[1:]), 24, np.uint8)
-    bench = Bench(tmp_path, np.concatenate([blank, *[clip] * 5]), formats=["NV12"], fps=15.0)
-    command = bench.command(*VLC_RX, "serve", "/dev/video0", "--port", "0", "--camera", VIDEO_CAMERA)
-
-    async def body(address: str) -> None:
-        async with Browser() as browser:
-            await browser.open(address)
-            await browser.until("document.getElementById('lock').textContent === 'no screen'")
-            await browser.until("document.getElementById('aim').textContent.includes('The picture is too dark.')")
-            await browser.until("document.getElementById('lock').textContent === 'locked'")
-            assert await browser.run("document.querySelectorAll('#live-picture polygon:not(.corners)').length") == 20
-            await browser.until("document.querySelectorAll('#live-packets li').length > 0")
-            assert browser.complaints == []
-
-    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
-    with subprocess.Popen(command, env=environment(), start_new_session=True, **pipes) as started:
-        try:
-            assert started.stdout is not None
-            asyncio.run(body(started.stdout.readline().strip()))
-        finally:
-            os.killpg(started.pid, signal.SIGTERM)
