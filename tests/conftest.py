@@ -3,6 +3,7 @@
 import os
 import signal
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -20,28 +21,16 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-@pytest.fixture(scope="session")
-def shared_captures() -> Path:
-    """The folder of reference captures beside the checkout, which is no part of the project."""
-    folder = _SHARED / "captures"
-    if not folder.is_dir():
-        pytest.skip(f"no reference captures at {folder}")
-    return folder
+def _shared(folder: str) -> Any:
+    """A fixture: a folder of files beside the checkout, which is no part of the project."""
+
+    @pytest.fixture(scope="session")
+    def found() -> Path:
+        if not (_SHARED / folder).is_dir():
+            pytest.skip(f"no files for this test at {_SHARED / folder}")
+        return _SHARED / folder
+
+    return found
 
 
-@pytest.fixture(scope="session")
-def shared_cases() -> Path:
-    """The folder of odd files beside the checkout, which is no part of the project."""
-    folder = _SHARED / "cases"
-    if not folder.is_dir():
-        pytest.skip(f"no odd files at {folder}")
-    return folder
-
-
-@pytest.fixture(scope="session")
-def shared_real() -> Path:
-    """The folder of real pictures beside the checkout, which is no part of the project."""
-    folder = _SHARED / "real"
-    if not folder.is_dir():
-        pytest.skip(f"no real pictures at {folder}")
-    return folder
+shared_captures, shared_cases, shared_real = map(_shared, ("captures", "cases", "real"))

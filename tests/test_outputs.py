@@ -184,19 +184,18 @@ def test_a_temporary_file_is_not_where_a_link_may_wait_and_is_never_set_uid(tmp_
     assert victim.read_text() == "mine"
 
 
-@pytest.mark.parametrize("kind", ["pipe", "link"])
-def test_a_received_file_replaces_a_pipe_or_a_link_and_is_not_written_into_it(kind: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["file", "pipe", "link"])
+def test_a_received_file_replaces_what_is_there_and_is_not_written_into_it(kind: str, tmp_path: Path) -> None:
     path, victim = tmp_path / "out" / "a.txt", tmp_path / "victim"
     path.parent.mkdir()
     victim.write_text("mine")
-    if kind == "pipe":
-        os.mkfifo(path)
-    else:
-        path.symlink_to(victim)
+    make = {"file": lambda: path.write_text("mine"), "pipe": lambda: os.mkfifo(path)}
+    make.get(kind, lambda: path.symlink_to(victim))()
     received = ReceivedObject("a.txt", b"sent", 4, "00", 1, 1, "", 0, 0.0)
     with pytest.raises(InputError, match="exists with other content"):
         save_object(received, path.parent)
-    save_object(received, path.parent, force=True)
+    assert save_object(received, path.parent, force=True) == save_object(received, path.parent)  # no conflict any more
+    assert list(path.parent.iterdir()) == [path]
     assert path.is_file()
     assert not path.is_symlink()
     assert (path.read_bytes(), victim.read_text()) == (b"sent", "mine")

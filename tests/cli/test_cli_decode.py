@@ -25,7 +25,6 @@ from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
 Decode = Callable[..., tuple[int, str, str]]
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_frames"
 PHOTO = SAMPLES / "phone_chelsea_17k3.jpg"
-NAMED = ("--screen", "paper-34k6", "--camera")
 
 
 @pytest.fixture
@@ -112,20 +111,6 @@ def test_a_folder_that_may_not_be_read_and_a_link_to_nowhere(
     assert "b.png: is a link to gone.png, which is not there; name the file itself, or mend the link" in link
     assert "shut: the folder may not be read (Permission denied)" in shut
     assert code == 3
-
-
-def test_one_bad_file_never_stops_the_rest(tmp_path: Path, decode: Decode) -> None:
-    folder = tmp_path / "in"
-    folder.mkdir()
-    write_frame(folder / "a.png", 1)
-    (folder / "b.png").write_bytes(b"")
-    (folder / "c.jpg").write_bytes(b"\xff\xd8\xff" + bytes(50))
-    write_frame(folder / "d.png", 4)
-    code, out, _ = decode(folder, tmp_path / "missing.png", "--json", "-")
-    assert code == 3
-    records = without_times(out)
-    assert [record["status"] for record in records] == ["ok", "unreadable", "unreadable", "ok", "unreadable"]
-    assert all(record["source"] in record["message"] for record in records if record["status"] == "unreadable")
 
 
 def test_packets_below_the_asked_confidence_do_not_count_and_are_told(tmp_path: Path, decode: Decode) -> None:
@@ -216,7 +201,6 @@ def test_a_run_is_held_against_an_earlier_one(tmp_path: Path, decode: Decode) ->
         (lambda: np.zeros((600, 800), np.uint8), "is black; expose longer"),
         (lambda: np.full((600, 800), 255, np.uint8), "is saturated; expose shorter"),
         (lambda: np.zeros((60, 80), np.uint8), "use the picture in its full size"),
-        (lambda: np.random.default_rng(1).integers(90, 99, (600, 800), np.uint8), "photograph a screen that sends"),
     ],
 )
 def test_advice_is_by_what_was_seen(make: Any, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -227,22 +211,10 @@ def test_advice_is_by_what_was_seen(make: Any, told: str, tmp_path: Path, capsys
     assert "--corners" not in said
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "told"),
-    [
-        (["http://a.b/c.jpg"], 3, "is an address, and nothing is fetched"),
-        (
-            [str(SAMPLES / "xtrans_sky_17k3.dng"), *NAMED, str(SAMPLES / "xs10-small.toml")],
-            1,
-            "only the screen paper-34k6 was tried (--screen auto tries all)",
-        ),
-    ],
-)
-def test_advice_is_by_what_was_asked(
-    arguments: list[str], code: int, told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(["decode", *arguments]) == code
-    assert told in capsys.readouterr().out
+def test_advice_is_by_what_was_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    names = ["--screen", "paper-34k6", "--camera", str(SAMPLES / "xs10-small.toml")]
+    assert run(["decode", str(SAMPLES / "xtrans_sky_17k3.dng"), *names]) == 1
+    assert "only the screen paper-34k6 was tried (--screen auto tries all)" in capsys.readouterr().out
 
 
 def test_a_frame_without_a_profile_waits_for_the_lens_that_is_estimated(

@@ -9,14 +9,13 @@ from typing import Any
 
 import click
 import pytest
+from commands import COMMAND, ENVIRONMENT
 
 from rxcli import __version__
 from rxcli.cli import main as cli_main
 from rxcli.cli.main import run
 from rxcli.cli.printing import coloured
 from rxcli.errors import InputError
-
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
 
 
 def test_help_of_every_command_breaks_no_words_at_80_characters(
@@ -113,15 +112,14 @@ def test_no_module_is_taken_from_the_current_folder(way: str, tmp_path: Path) ->
         (photos / f"{name}.py").write_text(f"open({str(tmp_path / 'loaded')!r}, 'a').write({name!r})")
     for name in ("a.jpg", "b.jpg"):
         (photos / name).write_bytes(b"\xff\xd8\xff cut")
-    command = [sys.executable, *([str(script)] if way == "script" else ["-m", "rxcli.cli.main"])]
+    command = [sys.executable, str(script)] if way == "script" else COMMAND
     done = subprocess.run([*command, "decode", ".", "--workers", "2"], cwd=photos, env=ENVIRONMENT, check=False)
     assert done.returncode == 3
     assert not (tmp_path / "loaded").exists()
 
 
 def started(*command: str, **told: str) -> subprocess.CompletedProcess[str]:
-    whole = [sys.executable, "-m", "rxcli.cli.main", *command]
-    return subprocess.run(whole, env=ENVIRONMENT | told, capture_output=True, text=True, check=False)
+    return subprocess.run([*COMMAND, *command], env=ENVIRONMENT | told, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize("command", ["--help", "decode --help", "calibrate --help", "calibrate shutter --help"])
@@ -133,7 +131,7 @@ def test_help_is_the_same_without_docstrings(command: str) -> None:
 
 def test_a_machine_without_room_for_the_libraries_is_told_so() -> None:
     photo = Path(__file__).resolve().parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
-    command = f"ulimit -v 400000; exec {sys.executable} -m rxcli.cli.main decode --quiet {photo}"
+    command = f"ulimit -v 400000; exec {' '.join(COMMAND)} decode --quiet {photo}"
     done = subprocess.run(["bash", "-c", command], env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert done.returncode == 3
     assert (
@@ -175,7 +173,7 @@ def test_names_of_files_in_warnings_and_logs_are_printable(workers: str, tmp_pat
     """They may hold what clears a terminal, or turns its text round."""
     for name in ("a\x1b[2J\u202egpj.jpg", "b.jpg"):
         (tmp_path / name).write_bytes(b"\xff\xd8\xff cut")
-    command = [sys.executable, "-m", "rxcli.cli.main", "decode", ".", "--workers", workers, "--verbose"]
+    command = [*COMMAND, "decode", ".", "--workers", workers, "--verbose"]
     done = subprocess.run(command, cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert "a\\u001b[2J\\u202egpj.jpg" in done.stderr
     assert all(line.isprintable() for line in done.stderr.splitlines())

@@ -6,15 +6,14 @@ import json
 import os
 import resource
 import signal
-import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import COMMAND, ENVIRONMENT
 from small_frames import write_frame, write_profiles
 
 from rxcli.cli.main import run
@@ -23,8 +22,6 @@ from rxcli.runs.batch import Decoder
 from rxcli.runs.journal import Journal
 from rxcli.types import FrameResult, ReceivedObject
 
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-COMMAND = [sys.executable, "-m", "rxcli.cli.main"]
 Decode = Callable[..., tuple[int, str]]
 
 
@@ -196,22 +193,6 @@ def test_many_files_in_one_process_leave_nothing_behind(
     assert after_mb < before_mb + 8
 
 
-def test_a_file_whose_decoder_was_killed_is_tried_again(tmp_path: Path, folder: Path, decode: Decode) -> None:
-    out, cut, table = tmp_path / "o.jsonl", tmp_path / "cut.jsonl", tmp_path / "s.csv"
-    assert decode(folder, "--json", out)[0] == 0
-    whole = records(out)
-    for number in (0, 2):
-        killed = [json.loads(line) for line in out.read_text().splitlines()]
-        killed[number] |= {"status": "unreadable", "message": "it died", "retry": True, "columns": []}
-        cut.write_text("".join(json.dumps(record) + "\n" for record in killed))
-        assert decode(folder, "--json", cut, "--resume", "--summary", table) == (0, "")
-        found, order = records(cut), sorted(range(3), key=lambda place: place == number)
-        assert found[0].pop("run") == whole[0]["run"]
-        assert found == [{k: v for k, v in whole[place].items() if k != "run"} for place in order]
-        assert [row["packets"] for row in csv.DictReader(table.read_text().splitlines())] == ["10"] * 3
-        assert decode(folder, "--json", cut, "--resume")[0] == 0  # nothing is left to do, and the file is whole
-
-
 def test_the_packets_of_a_killed_run_stand_once(tmp_path: Path, folder: Path, decode: Decode) -> None:
     out, table = tmp_path / "o.jsonl", tmp_path / "p.csv"
     assert decode(folder, "--json", out, "--payloads", table)[0] == 0
@@ -371,34 +352,6 @@ def test_streams_that_take_or_give_nothing(
     if reason.startswith("stdout"):
         assert len([line for line in done.stderr.splitlines() if line.startswith("vlc-rx:")]) == 1
         assert (tmp_path / "s.csv").exists()
-
-
-# -- clusters
-
-
-@pytest.mark.parametrize("address", ["", " ", "nonsense://x", "tcp://", "tcp://x:notaport", "\0"])
-def test_addresses_that_are_none(address: str, folder: Path, decode: Decode) -> None:
-    pytest.importorskip("distributed", reason="dask.distributed is not installed (extra cluster)")
-    code, said = decode(folder, "--cluster", address)
-    assert code == 2
-    assert said.count("\n") == 1
-    assert "--cluster" in said
-
-
-@pytest.mark.parametrize("port", ["silent", "closed", "99999"])
-def test_a_server_that_is_silent_or_absent_is_given_up(port: str) -> None:
-    pytest.importorskip("distributed", reason="dask.distributed is not installed (extra cluster)")
-    from rxcli.errors import UsageError
-    from rxcli.runs.batch import Source
-    from rxcli.runs.cluster import decode_on_cluster
-
-    with socket.socket() as server:
-        server.bind(("127.0.0.1", 0))
-        if port == "silent":
-            server.listen()
-        address = f"tcp://127.0.0.1:{port if port.isdigit() else server.getsockname()[1]}"
-        with pytest.raises(UsageError, match="nothing within 1 s" if port == "silent" else "no Dask scheduler answers"):
-            next(decode_on_cluster([Source("a", "a")], None, address, connect_s=1.0))  # type: ignore[arg-type]
 
 
 # -- pictures

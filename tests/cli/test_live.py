@@ -12,7 +12,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from commands import ENVIRONMENT
@@ -21,9 +20,7 @@ from fake_camera import Bench
 from rxcli.cli.live import Status, format_status
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode
-from rxcli.ingest import open_source
 from rxcli.ingest.v4l2 import CameraCounts, LiveSource
-from rxcli.profiles import ScreenProfile, dump_profile, load_profile
 from rxcli.results.aim import Aim
 from rxcli.results.report import wrapped
 from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
@@ -178,42 +175,6 @@ def test_how_the_command_ends(
 def test_modes_are_listed(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["live", "/dev/video0", "--list"]) == ExitCode.OK
     assert capsys.readouterr().out.splitlines()[0] == "Y16 96 x 64 at 60 frames/s"
-
-
-def test_payloads_of_a_simulated_screen(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Simulated frames go through the system calls of a camera, and their payloads come out.
-
-    The camera shows one picture over and over, and the second frame is left out: it is the one before once more.
-    """
-    screen, clip = tmp_path / "loop.toml", tmp_path / "clip.avi"
-    paper = load_profile("paper-17k3", ScreenProfile)
-    loop = msgspec.structs.replace(paper, name="loop", slot_rate_hz=18000.0, payload_symbols=8)
-    screen.write_text(dump_profile(loop))
-    payload = np.random.default_rng(5).bytes(20 * 8 * 7 // 8)
-    scene = ["--preset", "video-1080p", "--screen", str(screen), "--picture", "sky", "--frames", "1", "--seed", "3"]
-    sent = ["--payload", f"hex:{payload.hex()}", "--start-slot", "40"]
-    assert run(["simulate", str(clip), *scene, *sent]) == ExitCode.OK
-    truth = json.loads((tmp_path / "clip.truth.json").read_text())
-    Bench(tmp_path, np.stack([frame.pixels for frame in open_source(clip)]), monkeypatch)
-    known = [f"{x},{y}" for x, y in truth["corners_sensor_px"]]
-    receiver = ["--screen", str(screen), "--camera", "xs10", "--corners", *known]
-    capsys.readouterr()
-    out = tmp_path / "o.jsonl"
-    assert run(["live", "/dev/video0", "--format", "GREY", "--frames", "2", "--json", str(out), *receiver]) == 0
-    assert "LOCKED" in capsys.readouterr().err
-    records = [json.loads(line) for line in out.read_text().splitlines()]
-    right = [
-        packet["payload"] == payload[7 * column["column"] :][:7].hex()
-        for record in records
-        for column in record["columns"]
-        for packet in column["packets"]
-    ]
-    assert len(right) >= 18  # one a column
-    assert np.mean(right) > 0.95
-    assert [record["frame"] for record in records] == [0, 1]
-    assert records[1]["skipped"] == {"doubled_frames": 1}
 
 
 @pytest.mark.parametrize(

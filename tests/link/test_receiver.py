@@ -4,12 +4,11 @@ import struct
 import tracemalloc
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import UsageError
 from rxcli.lab.benchmark.goodput import detect
 from rxcli.link import ldpc
 from rxcli.link.encoder import FileSending, MessageSending, file_object, message, packet_slots_of
@@ -17,7 +16,6 @@ from rxcli.link.files import FilesUnderWay
 from rxcli.link.formats import protect
 from rxcli.link.layout import announcement_layout
 from rxcli.link.receiver import LinkReceiver
-from rxcli.link.saving import save_object
 from rxcli.protocol import encode_packet, indices_to_bits
 from rxcli.types import FrameSoftBits, Message, ReceivedObject
 
@@ -274,30 +272,3 @@ def test_what_cannot_work_is_refused_with_what_would() -> None:
         message("x" * 200)
     with pytest.raises(UsageError, match="object id"):
         file_object("a", b"x", 0xFFFE)
-
-
-# -- saving ------------------------------------------------------------------------------------------------------------
-
-
-def test_files_are_written_once_and_never_over_others(tmp_path: Path) -> None:
-    (received,) = receive(clip(file_object("x.txt", b"content"), 0, 20, np.random.default_rng(1)))
-    assert isinstance(received, ReceivedObject)
-    folder, outside = tmp_path / "in", tmp_path / "outside"
-    folder.mkdir()
-    path = folder / "x.txt"
-    assert save_object(received, folder).path == str(path)
-    save_object(received, folder)  # the same content is no conflict
-    path.write_bytes(b"precious")
-    with pytest.raises(InputError, match="exists with other content"):
-        save_object(received, folder)
-    assert path.read_bytes() == b"precious"
-    save_object(received, folder, force=True)
-    assert path.read_bytes() == b"content"
-    outside.write_bytes(b"safe")
-    path.unlink()
-    path.symlink_to(outside)  # is not followed
-    with pytest.raises(InputError):
-        save_object(received, folder)
-    save_object(received, folder, force=True)
-    assert (outside.read_bytes(), path.read_bytes()) == (b"safe", b"content")
-    assert [found.name for found in folder.iterdir()] == ["x.txt"]

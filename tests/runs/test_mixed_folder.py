@@ -2,9 +2,7 @@
 
 import csv
 import json
-import os
 import subprocess
-import sys
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -13,20 +11,20 @@ import av
 import cv2
 import numpy as np
 import pytest
+from commands import COMMAND, ENVIRONMENT
 from ingest_files import BAYER, write_dng
 from small_frames import write_frame, write_profiles
 
 from rxcli.errors import ExitCode
 from rxcli.ingest import open_source
 from rxcli.lab.benchmark.media import repeat_clip
+from rxcli.runs.processes import ONE_THREAD
 
 GOOD = (
     *("a.jpg", "monday/b.png", "monday/roof/c.dng", "tuesday/d.tif", "e.jpeg", "monday/f.mp4"),
     *("monday/roof/g.png", "tuesday/h.dng", "i.tif", "monday/j.jpeg", "monday/roof/k.jpg", "tuesday/l.avi"),
 )
 N_KILLS, N_FRAMES = 3, 4
-THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path), **THREADS}
 
 
 def write_good(path: Path, seed: int) -> None:
@@ -86,9 +84,9 @@ def test_killed_and_resumed_runs_give_the_same_results(good: list[Path], tmp_pat
     options = [*write_profiles(tmp_path), "--quiet", "--workers", "2", "--truth", "auto"]
 
     def start(out: Path, *more: str) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "rxcli.cli.main", "decode", str(folder), *options]
+        command = [*COMMAND, "decode", str(folder), *options]
         command += ["--json", str(out), "--summary", str(out.with_suffix(".csv")), *more]
-        return subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.DEVNULL)
+        return subprocess.Popen(command, env=ENVIRONMENT | ONE_THREAD, stderr=subprocess.DEVNULL)
 
     whole, killed = tmp_path / "whole.jsonl", tmp_path / "killed.jsonl"
     began = time.monotonic()
