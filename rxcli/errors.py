@@ -4,8 +4,6 @@ An expected failure of reception (no screen, no signal) is a status in the resul
 for input that cannot be read, for wrong configuration, and for wrong usage; `rxcli.cli.main` turns them into one line.
 """
 
-from __future__ import annotations
-
 import re
 from enum import IntEnum
 

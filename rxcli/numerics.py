@@ -1,7 +1,5 @@
 """Numerical functions shared by all stages."""
 
-from __future__ import annotations
-
 import os
 from contextlib import AbstractContextManager, nullcontext
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Options of the receiver."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field

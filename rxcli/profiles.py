@@ -4,8 +4,6 @@ An unknown key, a missing one or an impossible value is a `ProfileError` that na
 Times in seconds, lengths in pixels of the stored picture (integer coordinates are pixel centres).
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import re

@@ -4,8 +4,6 @@ A *slot* is the shortest on/off interval, a *symbol* is ten slots with `w` lit o
 symbol and payload symbols, a *burst* is one packet sent several times back to back.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from math import comb
 

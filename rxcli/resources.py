@@ -3,8 +3,6 @@
 The user's own files are in the system's folder for them (`platformdirs`), or in the folder named by `VLC_RX_HOME`.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import stat

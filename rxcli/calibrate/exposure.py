@@ -1,7 +1,5 @@
 """Exposure from the blur of a lamp's edges: a switched lamp through an exposure is a trapezoid in every period."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The one nonlinear least-squares fit of the calibrations, and what it combines and converts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

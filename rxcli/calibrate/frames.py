@@ -1,7 +1,5 @@
 """Light of a frame, for the stripes of lamps."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

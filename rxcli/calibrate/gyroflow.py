@@ -5,8 +5,6 @@ the tangent of the angle, so it is fitted to the rays behind the picture's point
 wrongly.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Lens model from pictures of a chessboard or ChArUco board."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any

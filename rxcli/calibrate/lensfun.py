@@ -4,8 +4,6 @@ Lensfun's distortion polynomials (ptlens, poly3, poly5) lead, as OpenCV's do, fr
 picture. They are converted to k1 k2 k3 by least squares over the picture.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A picture of a lens calibration's residuals."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Store the result of a calibration in a camera profile on disk."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import msgspec

@@ -6,8 +6,6 @@ goes on among the rest. Small lamps in a dark picture are searched each in its o
 lamp's region is then summed to one profile and fitted (`rxcli.calibrate.periodic`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Line delay from pictures of a screen that sends: the receiver's own estimate of an unknown camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

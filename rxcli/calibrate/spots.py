@@ -1,7 +1,5 @@
 """Bright spots in a dark picture: small lamps."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

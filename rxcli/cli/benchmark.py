@@ -1,7 +1,5 @@
 """`vlc-rx benchmark`: a scenario received and counted, the headline, two checkouts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

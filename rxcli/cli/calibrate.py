@@ -1,7 +1,5 @@
 """`vlc-rx calibrate`: lens and shutter of a camera, into a camera profile."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace

@@ -1,7 +1,5 @@
 """The user's `config.toml`: defaults of a few options. The command line and the environment override them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

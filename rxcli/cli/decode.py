@@ -1,7 +1,5 @@
 """`vlc-rx decode`: photos, RAW files, clips and folders. Here are its options; `rxcli.cli.decoding` does the work."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import click

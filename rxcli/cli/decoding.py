@@ -1,7 +1,5 @@
 """What `vlc-rx decode` does: claim its outputs, decode every source, write what was asked for."""
 
-from __future__ import annotations
-
 import json
 import logging
 import re

@@ -1,7 +1,5 @@
 """`vlc-rx demo`: a simulated screen sends a text, a simulated phone photographs it, the receiver reads it."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Groups of commands: help without arguments, suggestions for mistyped names."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import click

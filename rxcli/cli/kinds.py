@@ -1,7 +1,5 @@
 """Kinds of values that options take: what the command line gives, checked and typed."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

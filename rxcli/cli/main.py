@@ -4,8 +4,6 @@ Nothing heavy is imported before a command runs, so that `vlc-rx --help` is quic
 same reason.
 """
 
-from __future__ import annotations
-
 import gc
 import io
 import json

@@ -1,7 +1,5 @@
 """`vlc-rx profiles`: known screens and cameras, and which a file would get."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What `encode` and `simulate` send: a text, a URI, a file, or raw payload."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

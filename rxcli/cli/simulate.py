@@ -1,7 +1,5 @@
 """`vlc-rx simulate`: captures with truth."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from dataclasses import replace

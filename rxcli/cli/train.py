@@ -1,7 +1,5 @@
 """`vlc-rx train`: fit the auto-encoder and export it."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from importlib.util import find_spec
 from math import isnan

@@ -3,8 +3,6 @@
 Readers are imported when a file of their kind comes, because each brings a heavy library.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

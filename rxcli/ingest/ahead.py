@@ -1,7 +1,5 @@
 """Read frames ahead in a separate thread, so that file decoding does not wait for the receiver."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Generator

@@ -4,8 +4,6 @@ A decoder flags the frame that it stumbles over, or gives none for its packet; t
 good. So every frame is traced to its packet, and packets are judged in the order of decoding.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Where a file of a clip ends by the sizes that its container states."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -4,8 +4,6 @@ LibRaw fills the missing part of a truncated file with arbitrary values, without
 that directories claim, however often they claim them, so a file of a megabyte can keep it busy for minutes.
 """
 
-from __future__ import annotations
-
 import struct
 from contextlib import suppress
 from math import nan

@@ -4,8 +4,6 @@ libheif rotates and mirrors pixels by the file's `irot` and `imir` properties an
 here, because rows must stay in readout order.
 """
 
-from __future__ import annotations
-
 import io
 from dataclasses import replace
 from pathlib import Path

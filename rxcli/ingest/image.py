@@ -3,8 +3,6 @@
 Colour is reduced to BT.601 luma, which is what a JPEG of the same picture would hold.
 """
 
-from __future__ import annotations
-
 import io
 import logging
 import warnings

@@ -1,7 +1,5 @@
 """JPEG luma by simplejpeg, the fastest reader of it; shared by photos, MJPEG clips and cameras."""
 
-from __future__ import annotations
-
 import re
 import struct
 import tempfile

@@ -1,7 +1,5 @@
 """Colour reduced to luma."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

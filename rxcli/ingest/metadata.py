@@ -4,8 +4,6 @@ EXIF is parsed from bytes found without opening the picture (RAF included, whose
 Missing, broken or absurd values are None and never fail a frame.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import struct

@@ -3,8 +3,6 @@
 Pixels stay in readout order throughout the receiver; this exists for readers that turn them unasked.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 

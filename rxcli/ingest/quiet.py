@@ -1,7 +1,5 @@
 """Suppression of the messages of libpng, libtiff and LibRaw on stderr; errors are raised anyway."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Frames are views into LibRaw's memory, which lives as long as an array of it doe
 so the decoder is never closed here. Pixels are those of the default crop and are never turned.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Identify the kind of a file from its first bytes, or from its suffix if they are ambiguous."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Times of frames that advance: by the nominal rate where a source gives none, or equal or earlier ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 #: A time that is earlier by more frames than are ever out of order begins another clip, joined to the one before.

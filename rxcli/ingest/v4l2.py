@@ -5,8 +5,6 @@ and gives no times. FFmpeg's input (through PyAV) gives times, but sets neither 
 log alone, and takes YUYV where 10 or 12 bits are asked for.
 """
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import math

@@ -1,7 +1,5 @@
 """The part of the Linux V4L2 interface (linux/videodev2.h) that a capture needs, on 64-bit machines."""
 
-from __future__ import annotations
-
 import ctypes
 from typing import Any
 

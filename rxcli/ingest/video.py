@@ -4,8 +4,6 @@ FFmpeg decodes several frames at a time in threads of its own, except MJPEG, whi
 go to simplejpeg in a few threads here (2.3 to 2.6 times faster). Some frames are read ahead (`rxcli.ingest.ahead`).
 """
 
-from __future__ import annotations
-
 import errno
 import os
 from collections import deque

@@ -1,7 +1,5 @@
 """Convert the soft bits in frame results to messages and files, and add those to the results."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Photographs of a text that show packets in part: which of its symbols each shows is found with the text itself."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Encoder for transmitters: messages and files to labels, and labels to slots."""
 
-from __future__ import annotations
-
 import zlib
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Contents of blocks: bodies of beacons, announcements, containers. Pure functions with all rules of acceptance."""
 
-from __future__ import annotations
-
 import struct
 import unicodedata
 import zlib

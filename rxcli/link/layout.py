@@ -3,8 +3,6 @@
 A *label* is the 7 bits of payload symbol (burst b, symbol s, column c); a column of weight w sends the first k(w).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 

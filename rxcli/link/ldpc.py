@@ -4,8 +4,6 @@ A code of `k` information bits has base graph 1 or 2 lifted by `z`. Block column
 first 2 z bits are never sent and filler bits are known zeros; all others, in order, are the *buffer*.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache

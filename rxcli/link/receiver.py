@@ -1,7 +1,5 @@
 """Link layer receiver: soft bits in, messages and files out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Write received files under their own names to one folder, replacing existing files only on request."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import replace

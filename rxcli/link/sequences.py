@@ -1,7 +1,5 @@
 """Pseudo-random sequences and index strides that sender and receiver share."""
 
-from __future__ import annotations
-
 from functools import cache
 from math import gcd
 

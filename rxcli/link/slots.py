@@ -4,8 +4,6 @@ Every format has one row a slot, first sent first. Bits are packed with column 0
 significant bit of the first byte; 1 is lit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import IO

@@ -1,7 +1,5 @@
 """Sums over soft bits, their similarity and their information."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

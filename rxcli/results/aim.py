@@ -1,7 +1,5 @@
 """What a person who aims a camera needs to know: is it locked, and if not, why, and what to do."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """An earlier run to hold a new one against: packets that it had, and the time that it took."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

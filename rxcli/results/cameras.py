@@ -1,7 +1,5 @@
 """With which screen and camera a frame was received."""
 
-from __future__ import annotations
-
 from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.receiver.camera import camera_profile
 from rxcli.types import Frame, FrameResult

@@ -1,7 +1,5 @@
 """What a frame brought, as plain data: the rows and columns that the terminal, `--payloads` and the pages show."""
 
-from __future__ import annotations
-
 import base64
 from typing import Any
 

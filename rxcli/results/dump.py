@@ -1,7 +1,5 @@
 """Arrays at the stage boundaries, written for people and for tests: one NPZ a frame."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass

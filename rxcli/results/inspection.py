@@ -1,7 +1,5 @@
 """Analysis of a decoded frame with the decided slots: light against slots, stage by stage."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """Map of a picture that explains the found or missing screen: coherence, and the columns as they were found."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

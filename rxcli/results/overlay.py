@@ -1,7 +1,5 @@
 """What is drawn over a picture: a small copy of it, and the outline of every column with what became of it."""
 
-from __future__ import annotations
-
 import base64
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """`inspect`'s page: one file that needs nothing else. Here is what it shows; `pages/inspect.js` draws it."""
 
-from __future__ import annotations
-
 import html
 import json
 import math

@@ -1,7 +1,5 @@
 """Results as JSON lines for programs, and back."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Results as tables and sentences for people."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math

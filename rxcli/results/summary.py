@@ -1,7 +1,5 @@
 """A run in figures: one row per source and a total, as text, CSV, Parquet, or JUnit's XML; and its exit code."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

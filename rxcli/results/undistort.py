@@ -1,7 +1,5 @@
 """Whole pictures without their lens distortion, for people to look at; the receiver itself never warps pixels."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path

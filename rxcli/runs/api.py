@@ -1,7 +1,5 @@
 """What `import rxcli` calls: one source, received by a function."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace

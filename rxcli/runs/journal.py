@@ -6,8 +6,6 @@ first line holds version and options under `run`, the first line of every source
 `file`, and its last line `last`. Resuming with other options is refused; changed files are decoded again.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os

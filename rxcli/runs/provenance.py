@@ -1,7 +1,5 @@
 """Which numbers a result depends on, beside version, options and profiles."""
 
-from __future__ import annotations
-
 from dataclasses import is_dataclass
 from hashlib import sha256
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Decode pictures in a separate process with limits: it may die, hang or run out of memory, and is then replaced."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """Follow a live camera in a separate process: its picture, state and payloads, for the page."""
 
-from __future__ import annotations
-
 import logging
 import signal
 import threading

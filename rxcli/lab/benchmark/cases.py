@@ -1,7 +1,5 @@
 """A case is a scene or clip as a receiver gets it. The ways to receive one, and the record of a reception."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

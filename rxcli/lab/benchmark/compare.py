@@ -5,8 +5,6 @@ line, which outlives what is moved and renamed within. The two take turns, and t
 counts.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

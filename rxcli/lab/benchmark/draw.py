@@ -1,7 +1,5 @@
 """What the benchmark draws: for a seed and a number, the same case every time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager

@@ -4,8 +4,6 @@ Every slot that a frame shows is lit or dark in white noise, every symbol is det
 go to the link layer as the receiver's would. Pixels are left out: they are measured on captures.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from math import ceil

@@ -1,7 +1,5 @@
 """Files of full size that receptions are timed on, and their bare decode, which the times are compared with."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The headline: error beside both yardsticks, run time beside the bare decode, and stability, in three minutes."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

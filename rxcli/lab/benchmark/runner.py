@@ -1,7 +1,5 @@
 """The one runner: draws the cases of a scenario, receives each in every way, and keeps a journal of it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed

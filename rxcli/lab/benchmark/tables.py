@@ -1,7 +1,5 @@
 """Plain tables for people, CSV and JSON for programs, and a plot."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

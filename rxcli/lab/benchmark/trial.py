@@ -1,7 +1,5 @@
 """One trial: a simulated frame as a receiver gets it, and what the simulator knows of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path

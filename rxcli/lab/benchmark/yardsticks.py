@@ -1,7 +1,5 @@
 """Two yardsticks on the receiver's own frames: what no receiver can beat, and the paper's pipeline taken literally."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 

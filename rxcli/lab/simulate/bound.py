@@ -7,8 +7,6 @@ gain `a` and noise variance `v`: the log-likelihood is `Q m - P m^2 / 2`, with `
 Where a part of the red light lags, it has a share and a gain of its own: `m` and `Q` are pairs, `P` is a matrix.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

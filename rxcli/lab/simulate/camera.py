@@ -5,8 +5,6 @@ Electrons of a pixel are `T(u, v) * sum over columns c of K_c(u, v) * m_c(row) +
 which the column was lit (exact). Focus blur is applied to `T`: it mixes places, and one row remains one instant.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """From a scene to captures in memory: the entry points of the simulator."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache

@@ -1,7 +1,5 @@
 """Captures as files: JPEG with metadata, DNG, PNG, TIFF, and clips through real encoders."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable
 from dataclasses import dataclass

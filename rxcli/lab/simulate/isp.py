@@ -4,8 +4,6 @@ Like a camera's, it is not linear and not reversible: cheap demosaicing, white b
 correction, tone curve, sharpening, eight bits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ the horizontal shift the picture, a turn about the line of sight rolls it, and a
 The speed is given as it appears: how far the picture's centre goes from frame to frame, in pixels, on average.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -4,8 +4,6 @@ A scene shows things in a light. The light is steady, switched (dimmed screens, 
 the same over the whole width. Some of the things look striped: blinds, keyboards, moire.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 

@@ -4,8 +4,6 @@ Screen places are (u, v), 0..1 from the top-left corner as a viewer sees the scr
 at pixel centres. The lens is the pinhole model with OpenCV's k1 k2 p1 p2 k3, written out here on its own.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

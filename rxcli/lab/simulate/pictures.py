@@ -1,7 +1,5 @@
 """Pictures for the screen: files, the ones that scikit-image ships, generated ones, and random dark ones."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Populations: captures as people take them, drawn from what differs between phones, screens, rooms and hands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import inf
 from typing import Any

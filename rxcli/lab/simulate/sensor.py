@@ -1,7 +1,5 @@
 """The sensor: colour filter array, electrons, noise, and the numbers that leave it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal

@@ -1,7 +1,5 @@
 """Rolling shutter: what share of a row's exposure each slot fills."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ Everything here is written from the air interface (sections 2 to 4) and shares o
 with the receiver.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

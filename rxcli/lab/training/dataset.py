@@ -4,8 +4,6 @@ A sample is the input of the network for the doubtful columns of a frame, with t
 by the light model, and the word that was sent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A fitted network as a model folder: ONNX file and card."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import warnings

@@ -1,7 +1,5 @@
 """The network, and its fit: strips, by the same convolutions along time each; pooled; then columns, likewise."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache

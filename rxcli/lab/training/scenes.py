@@ -1,7 +1,5 @@
 """Scenes to learn from, and others to be judged by: no picture and no camera stands in both."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
