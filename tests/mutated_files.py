@@ -442,7 +442,6 @@ def _begin(folder: Path) -> None:
 
 
 def _run_case(seed: int) -> dict[str, Any]:
-    assert _cases is not None
     return _cases.run(seed)
 
 

@@ -68,7 +68,6 @@ def test_strong_harmonics_are_no_fundamental() -> None:
     for harmonics in ([0.4, 0.0, 0.9], [0.4, 0.8, 0.3]):
         wave = sum(a * np.sin(2 * np.pi * (k + 1) * phase + k) for k, a in enumerate(harmonics))
         fit = fit_fundamental(1 + wave + 0.05 * rng.standard_normal(900), 3 / 90)
-        assert fit is not None
         assert 1 / fit.frequency == pytest.approx(90, rel=2e-3)
 
 
@@ -185,7 +184,6 @@ def test_the_interval_holds_as_often_as_it_says(duty: Any, noise: Any, gain: flo
         else:
             profile = exposed(light[:, None] * scene(400, 12), rng, noise, gain).mean(axis=1)
         fit = fit_periodic(profile, 1 / 25.5)
-        assert fit is not None
         deviations.append((fit.frequency - 1 / period) / fit.frequency_sd)
     assert sum(abs(d) < 1.96 for d in deviations) >= least
     assert np.std(deviations) > 0.5
@@ -210,7 +208,6 @@ def test_exposure_from_the_edges(on_s: float | None, exposure_s: float, exif_s: 
     assert found.exposure_s == (expected_s and pytest.approx(expected_s, rel=0.05))
     assert found.comment
     if found.exposure_s is not None:
-        assert found.interval_s is not None
         assert found.interval_s[0] < found.exposure_s < found.interval_s[1]
 
 
@@ -239,7 +236,6 @@ def test_a_mode_replaces_that_of_its_size_and_keeps_the_rest(tmp_path: Path) -> 
     assert saved.models == ("B",)
     assert saved.mode_for(4000, 3000) == other
     mode = saved.mode_for(640, 480)
-    assert mode is not None
     assert (mode.line_delay_s, mode.frame_rate_hz, len(saved.modes)) == (2e-5, 30.0, 2)
     path.write_text("hello = 1")
     with pytest.raises(ProfileError, match="cam"):
@@ -266,7 +262,6 @@ def test_command(lamp_file: str, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert record["periods"] == pytest.approx(9.6, rel=0.01)
     assert record["axis"] == "rows"
     mode = load_profile(str(profile), CameraProfile).mode_for(200, 480)
-    assert mode is not None
     assert mode.name == "clip"
     assert mode.line_delay_s == pytest.approx(record["line_delay_s"], abs=0, rel=1e-12)
     assert run([*arguments, "--region", "0,0,200,300"]) == 0

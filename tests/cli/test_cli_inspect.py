@@ -22,7 +22,6 @@ from rxcli.runs.batch import collect_sources
 def shown(page: Path) -> dict[str, Any]:
     """What a page draws, out of the page itself."""
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text())
-    assert found is not None
     data: dict[str, Any] = json.loads(found[1])
     return data
 

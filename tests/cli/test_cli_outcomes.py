@@ -285,7 +285,6 @@ def test_a_signal_ends_the_run_with_its_summary(
     folder, summary, junit = many(tmp_path / "in", 3000), tmp_path / "s.csv", tmp_path / "j.xml"
     options = ["--json", "-", "--summary", summary, "--junit", junit, "--workers", workers]
     started = start("decode", folder, *options, stdout=subprocess.PIPE)
-    assert started.stdout is not None
     assert started.stdout.readline().startswith(b'{"source"')
     started.send_signal(number)
     if pause_s is not None:
@@ -314,7 +313,6 @@ def test_a_summary_that_cannot_be_written_does_not_cost_the_others(
 def test_a_closed_pipe_leaves_both_summaries(form: list[str], tmp_path: Path) -> None:
     folder, summary, junit = many(tmp_path / "in", 3000), tmp_path / "s.csv", tmp_path / "j.xml"
     started = start("decode", folder, *form, "--summary", summary, "--junit", junit, stdout=subprocess.PIPE)
-    assert started.stdout is not None
     started.stdout.readline()
     started.stdout.close()
     assert started.stderr is not None

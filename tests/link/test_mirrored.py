@@ -52,7 +52,6 @@ def test_a_text_shows_how_the_columns_of_its_picture_lie(placement: Placement) -
     # What was uncertain by its number alone is certain.
     assert got.columns[9].packets[0].confidence == 0.8
     assert (got.column_certainty, got.column_offset, got.message) == (1.0, 0, "bright")
-    assert got.corners is not None
     left = -placement.shift if not placement.mirrored else COLUMNS + placement.shift
     assert got.corners[0].tolist() == pytest.approx([left, 0], abs=1e-4)
     # What is known of one camera says nothing of another one.
@@ -122,7 +121,6 @@ def test_a_front_camera_is_told_by_its_file(metadata: Metadata, named: bool) -> 
 def test_columns_count_from_the_right_on_request(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     payloads = write_frame(tmp_path / "a.png", 1)
     picture = cv2.imread(str(tmp_path / "a.png"))
-    assert picture is not None
     cv2.imwrite(str(tmp_path / "a.png"), picture[:, ::-1])
     names = write_profiles(tmp_path)
     assert run(["decode", str(tmp_path / "a.png"), "--mirrored", *names]) == 0

@@ -60,7 +60,6 @@ def test_a_failed_photo_says_why_wherever_it_is_read(
 
     assert run(["inspect", str(path), "--out", str(tmp_path / "page")]) == 1
     found = re.search(r'id="data">(.*?)</script>', (tmp_path / "page" / "index.html").read_text())
-    assert found is not None
     page = json.loads(found[1])
     assert next(name for name, good in page["steps"] if not good) == "screen found"
     assert (page["headline"], page["notes"], page["advice"]) == ("No screen found", [told[0]], told[1])

@@ -155,7 +155,6 @@ def test_truth_beside_a_capture(tmp_path: Path) -> None:
     assert truth_for(tmp_path / "a.b.jpg", "auto") is None
     (tmp_path / "a.b.truth.json").write_text(json.dumps(RAW))
     path = truth_for(tmp_path / "a.b.jpg", "auto")
-    assert path is not None
     assert load_truth(path).payload[2][1] == "f0f0f0f0f0"
     with pytest.raises(InputError, match="No such file"):
         load_truth(tmp_path / "none.truth.json")

@@ -40,12 +40,10 @@ def process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     finally:
         started.kill()
         started.wait()
-        assert started.stderr is not None
         started.stderr.close()
 
 
 def wait_for(started: subprocess.Popen[str], pattern: str) -> re.Match[str]:
-    assert started.stderr is not None
     for line in started.stderr:
         found = re.search(pattern, line)
         if found:

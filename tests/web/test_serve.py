@@ -341,7 +341,6 @@ def test_no_upload_is_left_however_the_server_ends(number: int, tmp_path: Path) 
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     told = ENVIRONMENT | {"TMPDIR": str(tmp_path)}
     with subprocess.Popen(command, env=told, start_new_session=True, **pipes) as server:
-        assert server.stdout is not None
         port = int(server.stdout.readline().decode().rsplit(":", 1)[1].strip("/\n"))
         with socket.create_connection(("127.0.0.1", port)) as slow:
             head = b"POST /photo HTTP/1.1\r\nHost: localhost\r\nContent-Length: 99999999\r\n\r\n"
