@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from made_stages import profiles_of
 from numpy.typing import NDArray
 
 from rxcli.protocol import encode_packet, payload_bits
@@ -89,15 +90,7 @@ def row_profiles(
     shape = (n_columns, shot.n_strips, shot.n_rows)
     light = shot.ambient + shot.level * picture(shape, shot, rng) * mixed[:, None]
     light += rng.normal(0, shot.sigma, shape)
-    return RowProfiles(
-        light=light.astype(np.float32),
-        inside=np.ones(shape, bool),
-        rows=np.arange(shot.first_row, shot.first_row + shot.n_rows),
-        sensor_row=None,
-        count=np.ones(shape[:2], np.float32),
-        noise_floor=shot.sigma**2,
-        noise_slope=0.0,
-    )
+    return profiles_of(light, shot.sigma**2, rows=shot.first_row + rows)
 
 
 def picture(shape: tuple[int, int, int], shot: Shot, rng: np.random.Generator) -> FloatArray:

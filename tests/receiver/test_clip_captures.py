@@ -1,7 +1,5 @@
 """Floors on the reference clips beside the checkout: pictures that the project's own simulator did not make."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import islice

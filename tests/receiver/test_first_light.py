@@ -1,7 +1,5 @@
 """What a laboratory sends first: the same in all columns, a counter, one column alone, all lit, half lit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

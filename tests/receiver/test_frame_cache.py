@@ -1,7 +1,5 @@
 """What is read of a frame once while outlines are compared: the last ones used are kept."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np

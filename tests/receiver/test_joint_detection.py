@@ -1,11 +1,10 @@
 """Slots of long exposures through a rough picture that is known, and the place of their clock."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_stages import clock_of, profiles_of
 
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import WEIGHTS, encode_packet
@@ -13,7 +12,7 @@ from rxcli.receiver.channel import ObservationModel
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, SlotLight
 from rxcli.receiver.still import detect_jointly, lateness
-from rxcli.types import Clock, Float32Array, RowProfiles
+from rxcli.types import Float32Array
 
 COLUMNS, STRIPS, ROWS_PER_SLOT, W = 4, 4, 8.0, 4
 UNKNOWN = np.full((COLUMNS, len(WEIGHTS)), -np.log(len(WEIGHTS)))
@@ -26,9 +25,7 @@ def rough_frame(exposure_slots: float, texture: float) -> tuple[Acquisition, Obs
     n = screen.packet_slots
     bits = rng.integers(0, 2, (COLUMNS, screen.payload_symbols * 7)).astype(np.uint8)
     sent = np.stack([encode_packet(each, W) for each in bits]).astype(np.float32)
-    clock = Clock(
-        ROWS_PER_SLOT, exposure_slots, n, -0.5, n, 0, np.zeros(1, np.int64), np.zeros(COLUMNS), header_peak_ratio=9.0
-    )
+    known = {"rows_per_slot": ROWS_PER_SLOT, "exposure_slots": exposure_slots, "packet_slots": n, "n_slots": n}
     rows = np.arange(int(n * ROWS_PER_SLOT))
     exposed = SlotLight(np.pad(sent, ((0, 0), (5, 5)))).mean_over(
         ((rows + 0.5) / ROWS_PER_SLOT + 5)[None], exposure_slots
@@ -36,16 +33,7 @@ def rough_frame(exposure_slots: float, texture: float) -> tuple[Acquisition, Obs
     picture = np.exp(rng.normal(0, texture, (COLUMNS, 1, rows.size // 4))).repeat(4, axis=2)
     picture = (picture * rng.uniform(0.8, 1.2, (COLUMNS, STRIPS, 1))).astype(np.float32)
     light = picture * exposed[:, None] + rng.normal(0, 0.004, picture.shape)
-    profiles = RowProfiles(
-        light=light.astype(np.float32),
-        inside=np.ones(picture.shape, bool),
-        rows=rows,
-        sensor_row=None,
-        count=np.ones((COLUMNS, STRIPS), np.float32),
-        noise_floor=1.6e-5,
-        noise_slope=0.0,
-        level=picture / 2,
-    )
+    profiles, clock = profiles_of(light, 1.6e-5, level=picture / 2), clock_of(COLUMNS, row0=-0.5, **known)
     model = ObservationModel(0.0, NoiseModel(4e-6, 0.0), Crosstalk.of(STRIPS, 0.02), Exposure.of(exposure_slots, 4))
     return Acquisition(screen, profiles, clock, (screen,)), model, sent
 

@@ -1,7 +1,5 @@
 """Clips from a hand: the screen moves from frame to frame and from row to row, and what else such clips do."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from fractions import Fraction
 from itertools import cycle

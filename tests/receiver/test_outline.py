@@ -1,7 +1,5 @@
 """Which column is the first: shifted outlines compared on the same rows, and how sure the columns' numbers are."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

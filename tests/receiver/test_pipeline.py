@@ -1,7 +1,5 @@
 """Frames in, packets or reasons out: small simulated scenes from clean to hopeless, and what no receiver can read."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -120,7 +118,6 @@ def test_the_screen_is_found_in_a_frame_of_true_proportions() -> None:
     score = score_of(result, taken)
     assert score.expected >= 20
     assert score.error_free == score.expected
-    assert result.corners is not None
     off = np.linalg.norm(result.corners - corners_of(taken), axis=1)
     assert off.max() < 0.005 * np.ptp(result.corners[:, 0])
 
@@ -206,7 +203,6 @@ def test_upside_down() -> None:
     """Turned by half a turn on the sensor: time runs on, the columns run from right to left."""
     taken = clean()
     options = options_for(taken)
-    assert options.corners is not None
     turned = frame_of(taken, np.ascontiguousarray(taken.pixels[:, ::-1]), orientation=2)
     mirrored = options.corners * [-1, 1] + [taken.pixels.shape[1] - 1, 0]
     lens = options.cameras[0].lens
@@ -270,7 +266,6 @@ def test_the_network_is_shown_what_its_time_allows(
     monkeypatch.setattr(still, "STILL", replace(still.STILL, max_network_slots=budget))
     taken = overexposed()
     report = received(frame_of(taken), options_for(taken)).denoiser
-    assert report is not None
     assert shown == [report["columns"]]
     assert least <= shown[0] <= most
 
@@ -317,7 +312,6 @@ def test_a_picture_that_was_turned_afterwards_is_received_turned_back(quarter_tu
     assert score_of(result.with_columns_mirrored() if upside_down else result, taken).error_free >= 18
     assert result.quarter_turns == (0 if upside_down else 4 - quarter_turns)
     back, turned_back = as_received(frame, result)
-    assert turned_back.corners is not None
     if not upside_down:
         assert np.array_equal(back.pixels, taken.pixels)
         assert np.abs(turned_back.corners - corners_of(taken)).max() < 8
@@ -346,11 +340,9 @@ def test_a_screen_too_small_says_how_much_it_needs() -> None:
     )
     result = received(frame_of(taken, pixels), options)
     assert result.status == "no_signal"
-    assert result.message is not None
     assert "the screen fills 25 % of the height: one packet at 8.65 kHz needs 34 % with this camera" in result.message
     quick = msgspec.structs.replace(camera, modes=(msgspec.structs.replace(mode, line_delay_s=line_delay / 4),))
     result = received(frame_of(taken, pixels), replace(options, cameras=(quick,)))
-    assert result.message is not None
     assert "a picture shows 19 % of a packet: send 6 more photos, or film" in result.message
     assert result.message.index("the screen may have no profile here") < result.message.index("a faster slot rate")
 
@@ -407,7 +399,6 @@ def test_a_camera_without_this_size_is_named() -> None:
     taken = clean()
     result = received(frame_of(taken, taken.pixels[:1000]), options_for(taken))
     assert result.status == "no_signal"
-    assert result.message is not None
     assert "truth" in result.message
     assert f"{taken.pixels.shape[1]} x 1000" in result.message
 

@@ -1,7 +1,5 @@
 """What is said of pictures that give no packets: the likeliest reason first."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

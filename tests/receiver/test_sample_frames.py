@@ -1,7 +1,5 @@
 """The shipped captures decode without naming a profile, each at least as well as its floor, and nothing is invented."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Light that is the same everywhere: lamps and dimmed screens give no packets, a screen that says one thing does."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Two screens side by side in one photograph: both are received, and records and tables say so."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,13 +1,12 @@
 """Pictures of unknown cameras from end to end."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from made_stages import hypothesis_of
 from small_frames import BOTTOM, LEFT, RIGHT, ROWS_PER_SLOT, SCREEN, TOP, write_frame
 from small_scene import scored
 
@@ -65,7 +64,6 @@ def test_an_unknown_camera_is_refitted_and_received(tmp_path: Path, told_exposur
     frame = replace(frame, metadata=replace(frame.metadata, exposure_s=told_exposure_s))
     result = next(receive([frame], OPTIONS))
     assert result.estimated["rows_per_slot"][0] == pytest.approx(ROWS_PER_SLOT, rel=1e-3)
-    assert result.exposure_s is not None
     assert result.exposure_s >= (told_exposure_s or 0.0)
     believable = [(column.column, p) for column in result.columns for p in column.packets if p.is_believable]
     right = [packet.payload == payloads[column] for column, packet in believable]
@@ -74,20 +72,8 @@ def test_an_unknown_camera_is_refitted_and_received(tmp_path: Path, told_exposur
 
 
 def _proposed(*rows_per_slot: float) -> list[blind.CameraHypothesis]:
-    return [
-        blind.CameraHypothesis(
-            rows_per_slot=rows,
-            packet_slots=OPTIONS.screens[0].packet_slots,
-            reversed=False,
-            curvature=np.zeros(4),
-            exposure_slots=0.5,
-            score=100.0,
-            rows_per_slot_sd=0.01,
-            curvature_sd=np.zeros(4),
-            number=number,
-        )
-        for number, rows in enumerate(rows_per_slot)
-    ]
+    known = {"packet_slots": OPTIONS.screens[0].packet_slots, "score": 100.0, "rows_per_slot_sd": 0.01}
+    return [hypothesis_of(rows, number=n, curvature_sd=np.zeros(4), **known) for n, rows in enumerate(rows_per_slot)]
 
 
 def _chosen(
@@ -104,7 +90,6 @@ def test_packets_decide_between_hypotheses(tmp_path: Path, monkeypatch: pytest.M
         found = _chosen(frame, proposed, monkeypatch)
         assert isinstance(found, Found)
         chosen = found.best.hypothesis.camera.hypothesis
-        assert chosen is not None
         assert chosen.rows_per_slot == right.rows_per_slot
 
 

@@ -1,7 +1,5 @@
 """Clips whose camera nobody told: chosen and refitted as of photographs."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -34,7 +32,6 @@ def _unknown(clip: Clip) -> ReceiverOptions:
 
 
 def _line_delay_s(clip: Clip) -> float:
-    assert clip.truth.camera is not None
     return float(clip.truth.camera["line_delay_s"])
 
 
@@ -53,7 +50,6 @@ def test_a_screen_is_found_in_what_changed_between_frames() -> None:
     clip = simulate(8, 2, picture="coins", exposure_slots=5.0, height_scale=1.0)
     first, second = clip.frames
     corners = clip.options.corners
-    assert corners is not None
     column_px = np.ptp(corners[:, 0]) / 20
     found = screen_in_changes(FrameCache(first), second, ReceiverOptions())
     assert np.abs(found[0].corners - corners)[:, 0].max() < 0.6 * column_px

@@ -1,7 +1,5 @@
 """Clips: time through the frames, bursts over several frames, what is reused and what makes it start again."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -10,6 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from made_stages import clock_of
 from numpy.typing import NDArray
 
 from rxcli import numerics
@@ -117,7 +116,6 @@ def test_a_packet_stands_once_in_the_last_frame_that_shows_it(clip: Clip, result
     for result in results:
         for column in result.columns:
             for packet in column.packets:
-                assert packet.frames is not None
                 assert packet.frames[-1] == result.frame
     combined = [p for r in results for c in r.columns for p in c.packets if p.frames and len(p.frames) > 1]
     assert len(combined) >= 20
@@ -302,20 +300,11 @@ def test_frames_with_nothing_new_are_passed_over_on_request(monkeypatch: pytest.
     assert {b for b, _ in bursts_in(thinned)} == {b for b, _ in bursts_in(every)}
 
 
-def clock_at(slot: float, rows_per_slot: float = 5.0, packet: int = 70) -> Clock:
+def clock_at(slot: float) -> Clock:
     """A clock whose sensor row 0 is `slot`."""
     whole = int(np.floor(slot))
-    return Clock(
-        rows_per_slot=rows_per_slot,
-        exposure_slots=1.0,
-        packet_slots=packet,
-        row0=-(slot - whole) * rows_per_slot,
-        n_slots=100,
-        first_slot=whole % packet,
-        burst=np.zeros(3, np.int64),
-        delay_slots=np.zeros(20),
-        header_peak_ratio=5.0,
-    )
+    known = {"row0": -(slot - whole) * 5.0, "first_slot": whole % 70}
+    return clock_of(20, n_slots=100, burst=np.zeros(3, np.int64), header_peak_ratio=5.0, **known)
 
 
 @pytest.mark.parametrize("digits", [3, 6])
@@ -449,7 +438,6 @@ def test_errors_that_rows_have_in_common_count_as_one(together: int) -> None:
     slots = np.repeat(rng.integers(0, 2, (8, 200)), 5, axis=1).astype(np.float32)
     seen = ColumnLight(slots + noise, np.full((8, 1000), 50, np.float32))
     judged = known.placed(inside).judge(seen, slots, 40.0, 0.0, 5.0)
-    assert judged is not None
     # Each row tells 1 / 0.1^2, whatever was foreseen; five that err together tell what one does.
     expected = 100 / together
     assert np.median(judged.precision) == pytest.approx(expected, rel=0.1)

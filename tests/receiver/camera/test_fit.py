@@ -1,11 +1,10 @@
 """An estimated camera fitted to decoded slots."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_stages import clock_of, hypothesis_of
 
 from rxcli.protocol import encode_packet, payload_bits
 from rxcli.receiver import camera as blind
@@ -56,16 +55,8 @@ def _weight(bits: np.ndarray) -> int:
 
 def _hypothesis(curvature: FloatArray, reverse: bool = False) -> blind.CameraHypothesis:
     """A first estimate: a period that is off by a thousandth, most of the bend, an exposure too short."""
-    return blind.CameraHypothesis(
-        rows_per_slot=1.001 * ROWS_PER_SLOT,
-        packet_slots=LENGTH,
-        reversed=reverse,
-        curvature=0.9 * _as_stored(curvature, reverse),
-        exposure_slots=1.3,
-        score=300.0,
-        rows_per_slot_sd=0.001,
-        curvature_sd=np.full(4, 1e-3),
-    )
+    known = {"packet_slots": LENGTH, "curvature": 0.9 * _as_stored(curvature, reverse)}
+    return hypothesis_of(1.001 * ROWS_PER_SLOT, reversed=reverse, exposure_slots=1.3, **known)
 
 
 def _as_stored(curvature: FloatArray, reverse: bool) -> FloatArray:
@@ -79,17 +70,8 @@ def _settled(
 
 
 def _clock(estimate: blind.CameraHypothesis) -> Clock:
-    return Clock(
-        rows_per_slot=estimate.rows_per_slot,
-        exposure_slots=estimate.exposure_slots,
-        packet_slots=LENGTH,
-        row0=START - 0.6,
-        n_slots=300,
-        first_slot=0,
-        burst=np.zeros(3, np.int64),
-        delay_slots=np.zeros(COLUMNS),
-        header_peak_ratio=5.0,
-    )
+    known = {name: getattr(estimate, name) for name in ("rows_per_slot", "exposure_slots", "packet_slots")}
+    return clock_of(COLUMNS, row0=START - 0.6, n_slots=300, burst=np.zeros(3, np.int64), **known)
 
 
 @pytest.mark.parametrize(("curvature", "reverse"), [(np.zeros(4), False), (BEND, False), (BEND, True)])

@@ -1,7 +1,5 @@
 """Hypotheses of unknown cameras against cameras that are known, and the reasons where nothing can be estimated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from made_stages import hypothesis_of, profiles_of
 
 from rxcli.ingest import open_source
 from rxcli.lab.simulate.capture import prepare
@@ -26,7 +25,7 @@ from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.light import NoiseModel
 from rxcli.receiver.receive import receive
 from rxcli.receiver.screen import geometry
-from rxcli.types import FloatArray, Frame, Lens, RowProfiles
+from rxcli.types import FloatArray, Frame, Lens
 
 SCREENS = usual_screens()
 
@@ -172,17 +171,8 @@ def test_bend_terms_are_the_lens_model_at_any_focal_length() -> None:
 
 
 def test_an_estimate_can_be_kept_as_a_profile() -> None:
-    hypothesis = blind.CameraHypothesis(
-        rows_per_slot=5.0,
-        packet_slots=130,
-        reversed=False,
-        curvature=np.array([0.1, -0.2, 3e-4, -1e-4]),
-        exposure_slots=0.8,
-        score=400.0,
-        rows_per_slot_sd=0.001,
-        curvature_sd=np.full(4, 1e-3),
-        exposure_slots_sd=0.02,
-    )
+    curvature = np.array([0.1, -0.2, 3e-4, -1e-4])
+    hypothesis = hypothesis_of(5.0, curvature=curvature, exposure_slots=0.8, exposure_slots_sd=0.02)
     estimated = blind.summary(hypothesis, 17300.0)
     assert estimated["line_delay_s"] == pytest.approx((1 / (5 * 17300), 0.001 / 5 / (5 * 17300)))
     profile = blind.camera_profile(estimated, "mine", "Maker", "Phone X", 4032, 3024)
@@ -190,13 +180,9 @@ def test_an_estimate_can_be_kept_as_a_profile() -> None:
     assert again == profile
     assert again.matches("maker", "phone x")
     mode = again.mode_for(4032, 3024)
-    assert mode is not None
     assert mode.exposure_s == pytest.approx(0.8 / 17300)
     assert again.lens is not None
-    lens, kept = (
-        blind.lens_of(hypothesis.curvature, 4032, 3024),
-        geometry.lens_for(again.lens, 4032, 3024),
-    )
+    lens, kept = blind.lens_of(curvature, 4032, 3024), geometry.lens_for(again.lens, 4032, 3024)
     points = np.array([[100.0, 200.0], [3900.0, 2800.0]])
     assert lens is not None
     np.testing.assert_allclose(geometry.distort(points, kept), geometry.distort(points, lens))
@@ -244,15 +230,8 @@ def test_pictures_without_stripes_propose_nothing() -> None:
 
 def test_rows_against_the_readout_are_turned_and_back() -> None:
     rng = np.random.default_rng(5)
-    profiles = RowProfiles(
-        light=rng.random((2, 3, 7)).astype(np.float32),
-        inside=rng.random((2, 3, 7)) > 0.5,
-        rows=np.arange(4, 11),
-        sensor_row=np.arange(4, 11) + rng.random((2, 3, 7)),
-        count=np.ones((2, 3), np.float32),
-        noise_floor=1e-4,
-        noise_slope=0.0,
-    )
+    light, inside, rows = rng.random((2, 3, 7)), rng.random((2, 3, 7)) > 0.5, np.arange(4, 11)
+    profiles = profiles_of(light, inside=inside, rows=rows, sensor_row=rows + rng.random((2, 3, 7)))
     turned = blind.in_time_order(profiles, 20)
     assert turned.rows.tolist() == list(range(9, 16))
     assert turned.sensor_row is not None

@@ -1,11 +1,10 @@
 """The light model against numeric integration and links whose every slot is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_stages import clock_of
 from numpy.typing import NDArray
 from row_profiles import Link, Shot, random_link, row_profiles, sigma_of, slot_odds
 
@@ -28,17 +27,9 @@ def true_clock(shot_gain: Shot, packet_slots: int, n_columns: int) -> Clock:
     first_slot = before % packet_slots
     n_copies = -(-(first_slot + n_slots) // packet_slots)
     burst = (before // packet_slots + np.arange(n_copies)) // 3
-    return Clock(
-        rows_per_slot=shot_gain.rows_per_slot,
-        exposure_slots=shot_gain.exposure_slots,
-        packet_slots=packet_slots,
-        row0=(before - shot_gain.start_slot) * shot_gain.rows_per_slot,
-        n_slots=n_slots,
-        first_slot=first_slot,
-        burst=burst - burst[0],
-        delay_slots=np.zeros(n_columns),
-        header_peak_ratio=10.0,
-    )
+    known = {"packet_slots": packet_slots, "n_slots": n_slots, "first_slot": first_slot, "burst": burst - burst[0]}
+    known |= {name: getattr(shot_gain, name) for name in ("rows_per_slot", "exposure_slots")}
+    return clock_of(n_columns, row0=(before - shot_gain.start_slot) * shot_gain.rows_per_slot, **known)
 
 
 def true_slots(link: Link, shot_gain: Shot, n_slots: int) -> NDArray[np.float32]:

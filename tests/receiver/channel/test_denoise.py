@@ -1,7 +1,5 @@
 """The auto-encoder's input contract, the model folder, inference, and the gate in the receiver."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import shutil
@@ -351,7 +349,6 @@ def test_a_clean_frame_goes_without(trials: dict[str, Trial]) -> None:
 def test_always_runs_on_every_column_and_harms_none(trials: dict[str, Trial]) -> None:
     result, score = received(trials["clean"], "always")
     assert score.bit_errors == 0
-    assert result.denoiser is not None
     assert result.denoiser["columns"] == 20
     assert result.denoiser["kept"] == sum(column.denoised for column in result.columns)
 
@@ -360,7 +357,6 @@ def test_doubtful_columns_get_a_second_opinion(trials: dict[str, Trial]) -> None
     never, without = received(trials["hard"], "never")
     auto, with_it = received(trials["hard"], "auto")
     assert never.denoiser is None
-    assert auto.denoiser is not None
     assert 0 < auto.denoiser["columns"] <= 20
     assert with_it.error_free >= without.error_free
 
@@ -374,7 +370,6 @@ def test_the_receiver_goes_on_without_a_broken_model(trials: dict[str, Trial], m
     monkeypatch.setattr(still, "_denoiser", broken)
     auto, _ = received(trials["hard"], "auto")
     assert packets(auto) == packets(never)
-    assert auto.denoiser is not None
     assert "does not match its checksum; install the package again" in auto.denoiser["message"]
 
 
@@ -385,7 +380,6 @@ def test_corrections_are_kept_only_where_they_leave_less_doubt(trials: dict[str,
     lock = found.best.acquisition
     seen = still.decode(lock, options.skip, found.best.reception)
     better, kept, report = still.apply_autoencoder(lock, seen, options)
-    assert report is not None
     assert report["kept"] == len(kept) > 0
     columns = sorted(kept)
     assert (better.best_confidence(kept)[columns] > seen.best_confidence()[columns]).all()

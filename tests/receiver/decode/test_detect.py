@@ -1,7 +1,5 @@
 """The detector against enumeration of all symbol sequences, closed forms and its own calibration."""
 
-from __future__ import annotations
-
 from itertools import product
 from math import erf, log, pi, sqrt
 

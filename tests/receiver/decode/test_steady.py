@@ -1,7 +1,5 @@
 """Lamps and dimmed screens are no packets; packets are, whatever their payload repeats."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The joint detector against enumeration of all words, on smeared light, and where nothing is visible."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Colours that blink: red that lags behind the slots is left out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -51,7 +49,6 @@ def mosaic_of(rgb: NDArray[np.uint8], pattern: NDArray[np.uint8]) -> Frame:
 def test_red_that_lags_is_left_out(make: Any, red_blinks: float) -> None:
     frame = make(striped(red_blinks))
     contrast = red_contrast(frame)
-    assert contrast is not None
     assert abs(contrast[0] - red_blinks) < 0.25
     cache = FrameCache(frame).in_blinking_colours()
     assert (cache.frame is frame) == (red_blinks == 1)
@@ -62,7 +59,6 @@ def test_red_that_lags_is_left_out(make: Any, red_blinks: float) -> None:
 def test_the_first_rows_of_a_jpeg_show_that_red_blinks(red_blinks: float, is_whole_read: bool) -> None:
     jpeg = cv2.imencode(".jpg", striped(red_blinks)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
     stored = jpeg_colours_of(jpeg.tobytes())
-    assert stored.first_rows is not None
     first_rows, every = stored.first_rows(0.5), stored.thinned()
     assert 0.4 * len(every) < len(first_rows) < 0.6 * len(every)
     np.testing.assert_array_equal(first_rows, every[: len(first_rows)])
@@ -140,7 +136,6 @@ def write(path: Path, rgb: NDArray[np.uint8]) -> Path:
 def test_files_keep_their_colours(tmp_path: Path, name: str, error: float) -> None:
     rgb = striped(0.1)
     (frame,) = open_source(write(tmp_path / name, rgb))
-    assert frame.colours is not None
     weights = without_red(BT709 if name == "a.mp4" else BT601)
     left = (frame.colours.without_red() - frame.black) * (255 / (frame.white - frame.black))
     assert np.abs(left - luma_of(rgb, weights)).mean() <= error

@@ -1,7 +1,5 @@
 """The plane: sums of pixels, read once."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

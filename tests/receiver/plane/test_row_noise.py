@@ -1,7 +1,5 @@
 """Row noise: found where there is much, straight or bent by lens correction, and taken out of light and colours."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -58,7 +56,6 @@ def test_noise_is_taken_out_along_bent_rows(k1: float) -> None:
     left, before = (np.square(changes(each) - changes(plain)).mean() for each in (cache, noisy))
     assert left < 0.5 * before
     noise = find_row_noise(read_plane(cache.frame))
-    assert noise is not None
     # The rows are bent as far as they were drawn.
     x = y = 0.45
     bend = N_ROWS * noise.curvature @ [x**2 * y, x**4 * y, x**2 * y**3, x**2, x * y]

@@ -1,7 +1,5 @@
 """Row profiles against means computed by hand, and the noise model against noise of known size."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

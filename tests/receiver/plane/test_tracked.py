@@ -1,7 +1,5 @@
 """Strips of tracked frames show the light that is there."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

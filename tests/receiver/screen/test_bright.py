@@ -1,7 +1,5 @@
 """A bright screen whose picture hides the columns' borders: its outline is where it is bright."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

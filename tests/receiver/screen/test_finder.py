@@ -1,7 +1,5 @@
 """The outlines that the finder proposes, on pictures drawn here: no side of the screen need show."""
 
-from __future__ import annotations
-
 import tracemalloc
 from dataclasses import replace
 from functools import lru_cache
@@ -131,8 +129,6 @@ def apart(candidate: Outline, corners: FloatArray = CORNERS, lens: Lens | None =
     """Columns between a grid that was found and the true one, over the screen."""
     u, v = np.meshgrid(np.linspace(0.02, 0.98, 15), np.linspace(0.02, 0.98, 9), indexing="ij")
     points = geometry.screen_to_picture(np.stack([u, v], axis=-1), corners, lens)
-    assert candidate.grid is not None
-    assert candidate.n_columns is not None
     return candidate.grid.columns_at(points) - candidate.n_columns * u
 
 
@@ -486,7 +482,6 @@ def test_a_screen_that_moved_a_little_is_followed_and_a_lost_one_is_noticed() ->
     assert followed is not None
     np.testing.assert_allclose(followed, CORNERS, atol=16)
     barred = follow_outline(drawn("letterbox"), before, WIDE)
-    assert barred is not None
     np.testing.assert_allclose(barred[:, 1], before[:, 1], atol=16)
     assert follow_outline(plane_of(np.zeros((HEIGHT, WIDTH), np.uint8)), before, WIDE) is None
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
@@ -551,7 +546,6 @@ def test_blocks_of_a_coder_are_no_columns() -> None:
 def test_useless_pictures_are_named(pixels: NDArray[Any], reason: str) -> None:
     assert not find_outlines(plane_of(pixels), [WIDE, NARROW])
     useless = why_useless(pixels, 0.0, 255.0)
-    assert useless is not None
     assert reason in useless[0]
 
 

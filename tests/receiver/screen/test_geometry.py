@@ -1,7 +1,5 @@
 """Geometry on points against OpenCV and against projections computed another way."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -173,7 +171,6 @@ def test_row_map_of_a_picture_corrected_in_the_camera(order: tuple[int, ...]) ->
     """The sensor row of a corrected pixel is the y of its distorted place."""
     of = lens(corrected=True)
     found = geometry.column_outlines(PERSPECTIVE[list(order)], 5, 2, WIDTH, HEIGHT, of)
-    assert found.sensor_row is not None
     assert found.sensor_row.shape == found.inside.shape
     middle_x = (found.edges_x[1:] + found.edges_x[:-1]) / 2.0
     pixels = np.stack([middle_x, np.broadcast_to(found.rows, middle_x.shape)], axis=-1).astype(np.float64)

@@ -1,7 +1,5 @@
 """Where the screen is by the picture on it: shifts, skews, stripes that move on their own, flat pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Less than a packet in view: slots without a header."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from row_profiles import Shot, random_link, row_profiles

@@ -1,7 +1,5 @@
 """What a picture leaves open of the length of packets, and of which copies are one packet, lowers the confidence."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from row_profiles import Shot, random_link, row_profiles, sigma_of

@@ -1,12 +1,11 @@
 """Clock, bursts and delays of links whose every slot is known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from made_stages import clock_of, profiles_of
 from numpy.typing import NDArray
 from row_profiles import REPEATS, Link, Shot, random_link, row_profiles, sigma_of
 
@@ -271,17 +270,7 @@ def test_resample_follows_the_sensor_rows() -> None:
 
 
 def test_copies_and_back() -> None:
-    clock_ = Clock(
-        5.0,
-        1.0,
-        70,
-        0.0,
-        n_slots=180,
-        first_slot=33,
-        burst=np.arange(4),
-        delay_slots=np.zeros(2),
-        header_peak_ratio=9,
-    )
+    clock_ = clock_of(2, n_slots=180, first_slot=33, burst=np.arange(4))
     slots = np.random.default_rng(0).random((2, 180)).astype(np.float32)
     copies = clock_.to_copies(slots)
     assert copies.shape == (2, 4, 70)
@@ -306,15 +295,7 @@ def test_binned_strips_keep_the_light(n_strips: int, n_binned: int) -> None:
 def test_columns_that_start_at_their_own_rows_are_resampled_as_each_by_itself(n: int) -> None:
     rng = np.random.default_rng(5)
     rows = np.arange(200.0) + 6e-4 * (np.arange(200.0) - 90) ** 2 + rng.uniform(-0.2, 0.2, (3, 2, 1))
-    profiles = RowProfiles(
-        light=rng.random((3, 2, 200), dtype=np.float32),
-        inside=np.ones((3, 2, 200), bool),
-        rows=np.arange(200),
-        sensor_row=rows,
-        count=np.ones((3, 2), np.float32),
-        noise_floor=1e-4,
-        noise_slope=0.0,
-    )
+    profiles = profiles_of(rng.random((3, 2, 200), dtype=np.float32), sensor_row=rows)
     row0 = np.array([12.0, 13.7, 9.2])
     light, valid = sync.resample(profiles, row0, 1.3, n)
     for column, start in enumerate(row0):
