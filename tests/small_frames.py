@@ -60,14 +60,8 @@ def write_frame(path: Path, seed: int) -> list[str]:
     picture += rng.normal(0, 2, picture.shape)
     cv2.imwrite(str(path), np.clip(np.round(picture), 0, 255).astype(np.uint8))
     payloads = [bits_to_hex(column) for column in bits]
-    truth = {
-        "capture": path.name,
-        "columns": N_COLUMNS,
-        "payload_symbols": N_SYMBOLS,
-        "w": [W] * N_COLUMNS,
-        "payload_bits": [payload_bits(W, N_SYMBOLS)] * N_COLUMNS,
-        "frames": [{"frame": 0, "bursts": [{"burst": 0, "visible_slots": 100.0}]}],
-        "payload": {"0": payloads},
-    }
+    truth = {"capture": path.name, "columns": N_COLUMNS, "payload_symbols": N_SYMBOLS, "w": [W] * N_COLUMNS}
+    truth |= {"payload_bits": [payload_bits(W, N_SYMBOLS)] * N_COLUMNS, "payload": {"0": payloads}}
+    truth |= {"frames": [{"frame": 0, "bursts": [{"burst": 0, "visible_slots": 100.0}]}]}
     path.with_name(path.stem + ".truth.json").write_text(json.dumps(truth))
     return payloads

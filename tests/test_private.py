@@ -55,14 +55,8 @@ def run_forbidden(*command: object, cwd: Path) -> subprocess.CompletedProcess[st
     environment = {**os.environ, **places, "PYTHONDONTWRITEBYTECODE": "1", "VLC_RX_HOME": str(home)}
     environment.pop("ORT_DISABLE_TELEMETRY", None)
     try:
-        return subprocess.run(
-            [sys.executable, *map(str, command)],
-            cwd=cwd,
-            env=environment,
-            preexec_fn=forbid_internet,
-            capture_output=True,
-            text=True,
-        )
+        given = {"cwd": cwd, "env": environment, "capture_output": True, "text": True}
+        return subprocess.run([sys.executable, *map(str, command)], preexec_fn=forbid_internet, **given)
     except subprocess.SubprocessError:
         pytest.skip("this machine lets no process filter its system calls")
 

@@ -1,6 +1,7 @@
 """Profiles: shipped ones load, anything wrong is named, what is written is read back; `vlc-rx profiles`."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -51,14 +52,8 @@ def test_the_users_profiles_go_by_their_names(
     assert run(["decode", "none.jpg", "--camera", "broken", "--quiet"]) == ExitCode.USAGE
 
 
-SCREEN: dict[str, Any] = {
-    "format": 1,
-    "kind": "screen",
-    "name": "s",
-    "columns": 20,
-    "slot_rate_hz": 8650.0,
-    "payload_symbols": 5,
-}
+SCREEN: dict[str, Any] = {"format": 1, "kind": "screen", "name": "s"}
+SCREEN |= {"columns": 20, "slot_rate_hz": 8650.0, "payload_symbols": 5}
 CAMERA: dict[str, Any] = {
     "format": 1,
     "kind": "camera",
@@ -280,16 +275,9 @@ def test_python_checks_values_as_files_are_checked(kind: Any, change: dict[str, 
         receiver_options(msgspec.structs.replace(screen, columns=0))
 
 
-@pytest.mark.parametrize(
-    ("title", "kind"),
-    [
-        ("Screen profile", ScreenProfile),
-        ("Camera profile", CameraProfile),
-        ("Readout mode", ReadoutMode),
-        ("Lens model", LensModel),
-    ],
-)
-def test_the_page_on_profiles_lists_every_field_with_its_default(title: str, kind: type[msgspec.Struct]) -> None:
+@pytest.mark.parametrize("kind", [ScreenProfile, CameraProfile, ReadoutMode, LensModel])
+def test_the_page_on_profiles_lists_every_field_with_its_default(kind: type[msgspec.Struct]) -> None:
+    title = re.sub("(?!^)([A-Z])", r" \1", kind.__name__).capitalize()
     page = (Path(__file__).parents[1] / "docs" / "profiles.md").read_text(encoding="utf-8")
     section = page.split(f"\n## {title}\n")[1].split("\n## ")[0]
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if line.startswith("| `")]

@@ -203,20 +203,9 @@ def test_groups_ways_and_packets_are_counted() -> None:
         _record("a", ((0.95, 0), (0.999, 3), (0.5, 1)), shift=1, numbered=True, rows_per_slot=(4.0015, 0.001)),
         _record("b", status="no_screen", shift=2, numbered=False),
     ]
-    columns = [
-        "n",
-        "right",
-        "share",
-        "ber",
-        "likely",
-        "likely_wrong",
-        "sure",
-        "surely_wrong",
-        "changed",
-        "not_found",
-        "of_shown",
-    ]
-    columns += ["numbered_wrong", "target", "rows_within", "rows_none", "rows_wild", "in_1_sd", "in_2_sd"]
+    of_rows = ("rows_within", "rows_none", "rows_wild", "in_1_sd", "in_2_sd")
+    columns = ["n", "right", "share", "ber", "likely", "likely_wrong", "sure", "surely_wrong", "changed"]
+    columns += ["not_found", "of_shown", "numbered_wrong", "target", *of_rows]
     table = measures.rows(records, ["receiver", "bound"], columns, "bound")
     assert [(row["scenes"], row["way"]) for row in table[::2]] == [(n, "receiver") for n in ("a", "b", "all")]
     whole, bound = table[-2:]
@@ -227,7 +216,7 @@ def test_groups_ways_and_packets_are_counted() -> None:
     assert (whole["likely"], whole["sure"], whole["surely_wrong"], bound["changed"]) == (3, 1, 1, 3)
     assert whole["likely_wrong"] == 2
     assert (whole["not_found"], whole["of_shown"], whole["numbered_wrong"]) == (1, 2, 1)
-    assert [whole[name] for name in ("rows_within", "rows_none", "rows_wild", "in_1_sd", "in_2_sd")] == [1, 1, 0, 0, 1]
+    assert [whole[name] for name in of_rows] == [1, 1, 0, 0, 1]
     assert "target" not in whole
 
 
@@ -351,13 +340,7 @@ def test_a_scenario_writes_table_and_journal(tmp_path: Path) -> None:
 def test_drawn_captures_are_saved_with_all_that_is_known(
     more: dict[str, Any], files: list[str], tmp_path: Path
 ) -> None:
-    point = {
-        "screens": ["paper-8k65"],
-        "exposure_slots": [3.0, 3.0],
-        "width_px": [160, 160],
-        "rows": [0.3, 0.3],
-        **more,
-    }
+    point = {"screens": ["paper-8k65"], "exposure_slots": [3.0, 3.0], "width_px": [160, 160], "rows": [0.3, 0.3]} | more
     task = {"draw": "people", "ways": ["bound"], "seed": 2, "number": 0, "folder": str(tmp_path), "cae": None}
     (record,) = do({**task, "label": "3 slots", "point": point, "save": str(tmp_path)})
     known = json.loads((tmp_path / "3-slots-2-0-0.case.json").read_text())
@@ -386,18 +369,8 @@ def test_texts_that_arrive_are_counted(camera: dict[str, Any], tmp_path: Path) -
 def test_packets_of_earlier_journals_are_in_the_bins(tmp_path: Path) -> None:
     earlier = tmp_path / "earlier.jsonl"
     earlier.write_text(json.dumps({"key": "x", "records": [_record(packets=((0.95, 0), (0.95, 1)))]}) + "\n")
-    arguments = [
-        "confidence",
-        "--only",
-        "many rows",
-        "--count",
-        "1",
-        "--seed",
-        "5",
-        "--out",
-        str(tmp_path / "out"),
-        "--quiet",
-    ]
+    arguments = ["confidence", "--only", "many rows", "--count", "1", "--seed", "5", "--quiet"]
+    arguments += ["--out", str(tmp_path / "out")]
     alone, both = (CliRunner().invoke(benchmark, [*arguments, *more]) for more in ((), ("--also", str(earlier))))
     assert alone.exit_code == both.exit_code == 0, both.output
     counts = [int(result.output.split(" packets, ")[0].split()[-1]) for result in (alone, both)]

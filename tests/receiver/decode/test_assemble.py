@@ -228,13 +228,8 @@ def test_nothing_decoded_says_why() -> None:
 
 
 def test_a_column_never_seen_is_dark() -> None:
-    (first, _) = results_of(
-        clock_of(120, 0, [0, 0, 0]),
-        posteriors_of([5, 5], indices([5, 5]), probability=0.5001),
-        snr(120, 0.0),
-        samples_of(120),
-        0,
-    )
+    posteriors = posteriors_of([5, 5], indices([5, 5]), probability=0.5001)
+    (first, _) = results_of(clock_of(120, 0, [0, 0, 0]), posteriors, snr(120, 0.0), samples_of(120), 0)
     assert (first.status, first.snr_db, first.packets) == ("dark", None, ())
 
 
