@@ -104,13 +104,13 @@ def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str 
     return f"{result.message}; only the screen {screens[0].name} was tried (--screen auto tries all)"
 
 
-def _receive_still(cache: FrameCache, options: ReceiverOptions) -> Received:
-    """Receive every screen in a frame; the one with the most packets comes first."""
+def _receive_still(cache: FrameCache, options: ReceiverOptions, least: float) -> Received:
+    """Receive every screen in a frame with more than `least` evidence; the one with the most packets comes first."""
     nothing = FrameResult(cache.frame.source, cache.frame.index, cache.frame.time_s, "ok")
     screens = proposed_screens(cache, options)
     if isinstance(screens, Failure):
         return Received(failed(nothing, screens), {})
-    received = [_receive_screen(nothing, cache, outlines, options) for outlines in screens]
+    received = [_receive_screen(nothing, cache, outlines, options, least) for outlines in screens]
     clearest = received[0].result
     if not screens[0][0].stands_out and not clearest.packets and clearest.message != STEADY_LIGHT:
         return Received(failed(nothing, no_screen(cache, options)), {})
@@ -120,14 +120,16 @@ def _receive_still(cache: FrameCache, options: ReceiverOptions) -> Received:
 
 
 def _receive_screen(
-    nothing: FrameResult, cache: FrameCache, outlines: list[Outline], options: ReceiverOptions
+    nothing: FrameResult, cache: FrameCache, outlines: list[Outline], options: ReceiverOptions, least: float
 ) -> Received:
-    """Receive one screen; `nothing` is the result without any."""
+    """Receive one screen with more than `least` evidence; `nothing` is the result without any."""
     frame, timer = cache.frame, cache.timer
     # Search: where the columns are, what a row is in time, which screen and clock.
     found = search(cache, options, outlines=outlines)
     if isinstance(found, Failure):
         return Received(failed(nothing, found), {})
+    if found.best.evidence <= least:
+        return Received(replace(nothing, search=tuple(tried.step for tried in found.tried)), {})
     outline, context, acquisition = found.outline, found.best.context, found.best.acquisition
     camera = context.camera
     # Channel and decode, in turn: metrics of slots to symbols, and symbols to the picture.

@@ -41,24 +41,24 @@ def likeliest_bend(strips: ColumnStrips, level: Float32Array) -> FloatArray:
     level = np.ascontiguousarray(level[::strips_per_column])
     moved = _moved_rows(strips, strips_per_column, UNIT_BEND)
     bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, 16)
-    straight = (_moved(level, bend * moved) for bend in bends)
+    straight = (_moved(level, np.float32(bend) * moved) for bend in bends)
     return np.asarray(bends[np.argmax([(light[:-1] * light[1:]).sum() for light in straight])] * UNIT_BEND)
 
 
-def _moved_rows(strips: ColumnStrips, step: int, curvature: FloatArray) -> FloatArray:
+def _moved_rows(strips: ColumnStrips, step: int, curvature: FloatArray) -> Float32Array:
     """(M / step, R) rows by which a bend moves every row of each `step`-th strip."""
     terms = curvature_terms(strips.x[::step], strips.rows, strips.width, strips.height)
-    return np.asarray(np.tensordot(curvature, terms, 1) / strips.pitch)
+    return np.asarray(np.tensordot(curvature, terms, 1) / strips.pitch, np.float32)
 
 
-def _moved(level: Float32Array, moved: FloatArray) -> Float32Array:
+def _moved(level: Float32Array, moved: Float32Array) -> Float32Array:
     """Row r shows sensor row r + moved(r); sensor row s is found at s - moved(s), to first order of a small slope."""
     # Flat places: take_along_axis makes as many index arrays as there are axes.
-    index, start = np.arange(level.shape[1]), level.shape[1] * np.arange(len(level))[:, None]
+    index, start = np.arange(level.shape[1], dtype=np.float32), level.shape[1] * np.arange(len(level))[:, None]
     nearest = np.rint(index - moved).clip(0, index[-1]).astype(np.intp)
     back = moved.take(nearest + start)
-    place = (index - back).clip(0, index[-1] - 1e-6)
-    low = place.astype(np.intp)
+    place = (index - back).clip(0, index[-1])
+    low = np.minimum(place.astype(np.intp), level.shape[1] - 2)
     below, above = level.take(low + start), level.take(low + start + 1)
-    out = below + (above - below) * (place - low).astype(np.float32)
+    out = below + (above - below) * (place - low.astype(np.float32))
     return np.asarray(out * (np.abs(index - back - place) < 0.5), np.float32)

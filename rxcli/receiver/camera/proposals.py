@@ -232,8 +232,10 @@ def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_be
         exposures: stated exposure in slots by packet length, 0 for none.
         may_bend: whether the camera may have taken a distortion out.
     """
+    bends: list[FloatArray] = []
     for rows, strength, found, change in _long_exposures(strips, is_stated=any(exposures.values())):
-        bends = [np.zeros(4)] + ([likeliest_bend(strips, change)] if may_bend else [])
+        # The changes of the clearest line show the bend of all.
+        bends = bends or [np.zeros(4)] + ([likeliest_bend(strips, change)] if may_bend else [])
         for bend in bends:
             columns = columns_of(straightened(strips, change, bend), strips.n_columns)
             copies = _surprise(_autocorrelation(columns), round(2 * SLOTS_PER_SYMBOL * rows))
@@ -430,8 +432,10 @@ def _blurred(values: Float32Array, n: int) -> Float32Array:
 
 def _autocorrelation(columns: Float32Array, later: Float32Array | None = None) -> FloatArray:
     """(R,) sum over columns (C, R) of the product with the same columns later, or with others."""
+    import cv2
+
     n = columns.shape[1]
-    size = 1 << int(np.ceil(np.log2(2 * n)))
+    size = cv2.getOptimalDFTSize(2 * n)
     spectrum = np.fft.rfft(columns, size, axis=1)
     others = spectrum if later is None else np.fft.rfft(later, size, axis=1)
     return np.asarray(np.fft.irfft((spectrum * others.conj()).real.sum(axis=0), size)[:n])

@@ -68,9 +68,11 @@ class _Paths:
     variance: Float32Array
 
     def taken(self, index: IntArray) -> _Paths:
-        """The paths with the given numbers, (lanes, n)."""
-        lane = np.arange(len(index))[:, None]
-        return _Paths(*(getattr(self, field.name)[lane, index] for field in fields(self)))
+        """The paths with the given numbers, (lanes, n), or (n,) of every lane."""
+        lanes, n_paths = self.w.shape
+        place = index + n_paths * np.arange(lanes)[:, None]
+        every = (getattr(self, field.name) for field in fields(self))
+        return _Paths(*(values.reshape(-1, *values.shape[2:]).take(place, axis=0) for values in every))
 
 
 def detect(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> BurstPosteriors:
@@ -186,14 +188,10 @@ def _branches(paths: _Paths, books: IntArray, place: int) -> tuple[IntArray, _Pa
         (J,) the path that each branch extends; the branches, only where a lane allows them; (lanes, J) the log
         probability of their slot.
     """
-    log_words = _log_words()
-    begun = paths.slots & ((1 << place) - 1)
-    before = log_words[books, place, begun]
-    gain = np.stack([log_words[books, place + 1, 2 * begun + slot] - before for slot in (0, 1)], axis=2)
-    gain = gain.reshape(len(gain), -1)
+    gain = _log_slots()[place][books, paths.slots & ((1 << place) - 1)].reshape(len(books), -1)
     used = np.flatnonzero((gain > _NEVER / 2).any(axis=0))
     origin = used >> 1
-    out = paths.taken(np.broadcast_to(origin, (len(gain), origin.size)))
+    out = paths.taken(origin)
     out.slots = ((out.slots << 1) | (used & 1)) & _RECENT
     return origin, out, gain[:, used]
 
@@ -259,32 +257,33 @@ def _merged(branches: _Paths, n_recent: int, settings: SurvivorSettings) -> tupl
     lane = np.arange(lanes)[:, None]
     key = (branches.w << 2 * SLOTS_PER_SYMBOL) | (branches.slots & ((1 << n_recent) - 1))
     order = np.lexsort((-likelihood, key))
-    ordered = np.take_along_axis(key, order, 1)
+    place = order + n_branches * lane
+    ordered = key.take(place)
     is_first = np.ones((lanes, n_branches), bool)
     is_first[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
     number = is_first.cumsum(axis=1) - 1
     n_groups = int(number[:, -1].max()) + 1
+    number += n_groups * lane
     group = np.empty_like(number)
-    np.put_along_axis(group, order, number, 1)
-    row, place = np.nonzero(is_first)
-    best = np.zeros((lanes, n_groups), np.int64)
-    best[row, number[row, place]] = order[row, place]
+    group.put(place, number)
+    best = np.zeros(lanes * n_groups, np.int64)
+    best[number[is_first]] = order[is_first]
     top = likelihood.max(axis=1, keepdims=True)
     relative = np.exp(np.maximum(likelihood - top, -700))
-    total = np.bincount((lane * n_groups + group).ravel(), relative.ravel(), lanes * n_groups).reshape(lanes, n_groups)
-    total = np.log(np.maximum(total, TINY**10)) + top
-    n_chosen = min(settings.max_paths, int((total > top - settings.max_lag).sum(axis=1).max()), n_groups)
+    share = np.bincount(group.ravel(), relative.ravel(), lanes * n_groups).reshape(lanes, n_groups)
+    n_chosen = min(settings.max_paths, int((share > np.exp(-settings.max_lag)).sum(axis=1).max()), n_groups)
     chosen = np.broadcast_to(np.arange(n_groups), (lanes, n_groups))
     if n_chosen < n_groups:
-        chosen = np.argpartition(-total, n_chosen - 1, axis=1)[:, :n_chosen]
-    place_of = np.full((lanes, n_groups), -1)
-    np.put_along_axis(place_of, chosen, np.broadcast_to(np.arange(n_chosen), chosen.shape), 1)
-    paths = branches.taken(np.take_along_axis(best, chosen, 1))
+        chosen = np.argpartition(-share, n_chosen - 1, axis=1)[:, :n_chosen]
+    chosen = chosen + n_groups * lane
+    place_of = np.full(lanes * n_groups, -1)
+    place_of[chosen] = np.arange(n_chosen)
+    paths = branches.taken(best[chosen])
     # The remaining paths stand for the dropped ones: where nothing is visible, all are equally likely.
-    paths.log_likelihood = np.take_along_axis(total, chosen, 1)
-    paths.log_likelihood += np.logaddexp.reduce(total, axis=1, keepdims=True)
-    paths.log_likelihood -= np.logaddexp.reduce(np.take_along_axis(total, chosen, 1), axis=1, keepdims=True)
-    return np.take_along_axis(place_of, group, 1), paths
+    chosen_share = share.take(chosen)
+    paths.log_likelihood = np.log(np.maximum(chosen_share, TINY**10)) + top
+    paths.log_likelihood += np.log(share.sum(axis=1, keepdims=True) / chosen_share.sum(axis=1, keepdims=True))
+    return place_of[group], paths
 
 
 def _backward(
@@ -341,14 +340,21 @@ def _n_lit() -> NDArray[np.int64]:
 
 
 @cache
-def _log_words() -> FloatArray:
-    """(books, 11, 1024) log of the number of a book's words that begin with some slots, by their number and value."""
-    books = [[HEADER], *(codebook(w) for w in WEIGHTS), [dimming_symbol(w) for w in WEIGHTS]]
-    count = np.zeros((len(books) + 1, SLOTS_PER_SYMBOL + 1, _WORD + 1))
+def _log_slots() -> list[FloatArray]:
+    """Of each place in a word, (books, slots so far as a number, 2) log probability that the next slot is dark, lit."""
+    books = [
+        [HEADER],
+        *(codebook(w) for w in WEIGHTS),
+        [dimming_symbol(w) for w in WEIGHTS],
+        slot_patterns(SLOTS_PER_SYMBOL - 1),
+    ]
+    count = np.zeros((len(books), SLOTS_PER_SYMBOL + 1, _WORD + 1))
     for number, book in enumerate(books):
         values = np.array(book, np.int64) @ (1 << np.arange(SLOTS_PER_SYMBOL - 1, -1, -1))
         for length in range(SLOTS_PER_SYMBOL + 1):
             np.add.at(count[number, length], values >> (SLOTS_PER_SYMBOL - length), 1)
-    for length in range(SLOTS_PER_SYMBOL + 1):
-        count[_ARBITRARY, length, : 1 << length] = 2.0 ** (SLOTS_PER_SYMBOL - length)
-    return np.where(count > 0, np.log(np.maximum(count, 1)), _NEVER)
+    log = np.where(count > 0, np.log(np.maximum(count, 1)), _NEVER)
+    begun = [log[:, place, : 1 << place, None] for place in range(SLOTS_PER_SYMBOL)]
+    return [
+        log[:, place + 1, : 2 << place].reshape(*before.shape[:2], 2) - before for place, before in enumerate(begun)
+    ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from math import log
+from math import inf, log
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.frame.cache import FrameCache
@@ -15,6 +15,7 @@ from rxcli.receiver.plane import orientation
 from rxcli.receiver.search.cameras import known_camera
 from rxcli.receiver.search.outlines import ON_ITS_SIDE, lean_on_its_side, unreadable_orientation
 from rxcli.receiver.search.refusal import STEADY_LIGHT, likeliest_reason
+from rxcli.receiver.search.settings import SETTINGS
 from rxcli.types import Frame, FrameResult
 
 _UPSIDE_DOWN = (
@@ -29,8 +30,8 @@ _AS_STORED = (
 _SAME_LINE_DELAY, _SURE = 0.01, 0.9
 #: Packets of a long exposure that show that it was stated rightly.
 _PLAIN_LONG = 4
-#: Receives a photograph as it is.
-_Receive = Callable[[FrameCache, ReceiverOptions], Received]
+#: Receives a photograph as it is, if a screen has evidence of packets of more than a least.
+_Receive = Callable[[FrameCache, ReceiverOptions, float], Received]
 
 
 def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Receive) -> Received:
@@ -49,7 +50,7 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
     attempts = []
     for quarter_turns in orientation.QUARTER_TURNS if lean < 0 else ():
         back = orientation.turned_frame(frame, quarter_turns)
-        attempt = receive(FrameCache(back, cache.timer).in_blinking_colours(), options)
+        attempt = receive(FrameCache(back, cache.timer).in_blinking_colours(), options, -inf)
         result = orientation.as_stored(back, attempt.result, quarter_turns)
         if not _gives_few(result):
             rank = not _is_reversed(result), attempt.n_believable, quarter_turns
@@ -63,13 +64,15 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
 
 def _receive_stated(cache: FrameCache, options: ReceiverOptions, receive: _Receive) -> Received:
     """Receive a frame as profile and file state its camera; where few columns give packets, also as it is estimated."""
-    best = stated = received = receive(cache, options)
+    best = stated = received = receive(cache, options, -inf)
+    evidence = max((step.evidence for step in stated.result.search), default=0.0)
     for attempt, estimating in _with_estimates(cache, options):
-        # Without a hypothesis of the camera its exposure did not count.
         is_plain = best.n_believable >= _PLAIN_LONG and _is_long(best.result, cache.frame, options)
+        is_plain |= best.n_believable > 1 and evidence > SETTINGS.plain
+        # Without a hypothesis of the camera its exposure did not count.
         if not _gives_few(best.result) or is_plain or (attempt is not cache and not received.result.search):
             break
-        received = receive(attempt, estimating)
+        received = receive(attempt, estimating, evidence)
         # One packet is no evidence that what was stated is wrong.
         if received.n_believable > max(best.n_believable, 1) and _is_credible(received.result, cache.frame, options):
             message = _difference(cache.frame, options, stated, received, is_exposure=attempt is not cache)

@@ -16,6 +16,7 @@ from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.screen.find import ColumnLayout
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.pose import corners_by_slots
@@ -226,16 +227,21 @@ class _Walk:
         return (self._fresh, heapq.heappop(self._fresh)) if self._fresh else None
 
     def _score(self, hypothesis: Hypothesis) -> None:
-        """Make an initial pass; if there is a better hypothesis already, of the middle columns first.
+        """Make an initial pass; after a better hypothesis, and of a long exposure, of the middle columns first.
 
         The others follow if the middle ones come near the best score; if that is beyond doubt, if they beat its own.
         """
         best, acquisition = self._best(), _acquired(hypothesis)
-        if best is not None and hypothesis.screen.columns > SETTINGS.few_columns:
+        # Without packets an estimated camera is rejected, and joint detection takes long.
+        is_costly = hypothesis.camera.hypothesis is not None and acquisition.clock.exposure_slots > LONG_EXPOSURE_SLOTS
+        if (best is not None or is_costly) and hypothesis.screen.columns > SETTINGS.few_columns:
             half = self._measured(hypothesis, acquisition.of_columns(acquisition.middle_columns))
-            is_plain = best.evidence > SETTINGS.plain
-            least = evidence.middle_score(best) if is_plain else best.score - SETTINGS.reach
-            if half.score < least or half.evidence < min(SETTINGS.bail, best.evidence):
+            min_score, min_evidence = -np.inf, SETTINGS.bail
+            if best is not None:
+                is_plain = best.evidence > SETTINGS.plain
+                min_score = evidence.middle_score(best) if is_plain else best.score - SETTINGS.reach
+                min_evidence = min(SETTINGS.bail, best.evidence)
+            if half.score < min_score or half.evidence < min_evidence:
                 self._tried.append(Tried(hypothesis, half.evidence, half.score, "half"))
                 return
         scored = self._measured(hypothesis, acquisition)

@@ -1,0 +1,38 @@
+"""Further attempts at a photograph that gives few packets: none where the first one leaves no doubt of its camera."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from rxcli.options import ReceiverOptions
+from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.result import Received
+from rxcli.receiver.search.attempts import receive_either_way
+from rxcli.types import ColumnResult, Frame, FrameResult, Metadata, PacketResult, SearchStep
+
+
+@pytest.mark.parametrize(
+    ("evidence", "n_packets", "wanted"),
+    [
+        (500.0, 2, [-np.inf]),  # plain, however few of its columns are lit
+        (500.0, 1, [-np.inf, 500.0]),  # one packet is no evidence
+        (300.0, 2, [-np.inf, 300.0]),
+        (300.0, 10, [-np.inf]),
+    ],
+)
+def test_an_exposure_is_doubted_by_few_packets_of_little_evidence(
+    evidence: float, n_packets: int, wanted: list[float]
+) -> None:
+    asked: list[float] = []
+
+    def receive(cache: FrameCache, _: ReceiverOptions, least: float) -> Received:
+        asked.append(least)
+        packets = (PacketResult(0.0, 1.0, 8, "00", 0.9, 0.0),)
+        columns = tuple(ColumnResult(number, "ok", packets=packets * (number < n_packets)) for number in range(20))
+        step = SearchStep("", 0.0, evidence, evidence, "won")
+        return Received(FrameResult("photo", 0, 0.0, "ok", columns=columns, search=(step,)), {})
+
+    frame = Frame(np.zeros((8, 8), np.uint8), "photo", metadata=Metadata(exposure_s=1e-4))
+    receive_either_way(FrameCache(frame), ReceiverOptions(), receive)
+    assert asked == wanted
