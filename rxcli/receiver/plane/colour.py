@@ -15,18 +15,9 @@ from numpy.typing import NDArray
 
 from rxcli.receiver.plane.row_noise import RowNoise
 from rxcli.receiver.plane.rows import light_of, tone_to_light
+from rxcli.receiver.plane.settings import COLOUR
 from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
 
-#: Cells across a picture, their width in pixels, and rows of a block, in which each is dark and lit once.
-_N_CELLS, _CELL_PX, _BLOCK_ROWS = 48, 12, 96
-#: Light of dark slots over that of lit ones up to which red blinks, or hardly counts.
-_PLAIN_DARK = 0.02
-#: Shares of the stripes and of the rows of a picture in which a contrast of red from here on shows that it blinks.
-_ENOUGH_STRIPES, _ENOUGH_ROWS, _PLAINLY = 0.3, 0.3, 0.75
-#: Red blinks or not, with a contrast of 1 or 0, whichever is nearer; standard errors at which the other is excluded.
-_MIDDLE, _SURE = 0.5, 3.0
-#: Values of a colour, of the largest one, that are too dark to compare, and from which they may be clipped.
-_DARK, _CLIPPED = 0.01, 0.98
 #: Gain of a colour of the mosaic that is left out.
 _LEFT_OUT = float("inf")
 
@@ -38,25 +29,25 @@ def may_lag(plane: LightPlane) -> float:
     luma than red that lags.
     """
     n_cells = len(plane.sums) - 1
-    width, n_blocks = max(_CELL_PX // plane.cell_px, 1), plane.height // _BLOCK_ROWS
+    width, n_blocks = max(COLOUR.cell_px // plane.cell_px, 1), plane.height // COLOUR.block_rows
     if n_cells < width or not n_blocks:
         return 0.0
-    left = np.linspace(0, n_cells - width, _N_CELLS).astype(int)
-    rows = slice(n_blocks * _BLOCK_ROWS)
+    left = np.linspace(0, n_cells - width, COLOUR.n_cells).astype(int)
+    rows = slice(n_blocks * COLOUR.block_rows)
     values = (plane.sums[left + width, rows] - plane.sums[left, rows]) / np.float32(width * plane.cell_px)
-    blocks = light_of(plane, values, "srgb").reshape(_N_CELLS, n_blocks, -1)
-    dark, lit = blocks.min(axis=2), np.maximum(blocks.max(axis=2), np.float32(_PLAIN_DARK**2))
-    if np.median((dark / lit)[lit >= np.median(lit)]) <= _PLAIN_DARK:
+    blocks = light_of(plane, values, "srgb").reshape(COLOUR.n_cells, n_blocks, -1)
+    dark, lit = blocks.min(axis=2), np.maximum(blocks.max(axis=2), np.float32(COLOUR.plain_dark**2))
+    if np.median((dark / lit)[lit >= np.median(lit)]) <= COLOUR.plain_dark:
         return 0.0
     steps = np.diff(values)
     stripes = np.maximum((steps[1:] * steps[:-1]).sum(axis=0), 0).cumsum()
-    share = float(np.searchsorted(stripes, _ENOUGH_STRIPES * stripes[-1]) + _BLOCK_ROWS) / plane.height
-    return max(share, _ENOUGH_ROWS)
+    share = float(np.searchsorted(stripes, COLOUR.enough_stripes * stripes[-1]) + COLOUR.block_rows) / plane.height
+    return max(share, COLOUR.enough_rows)
 
 
 def in_blinking_colours(frame: Frame, contrast: tuple[float, float] | None) -> Frame:
     """The frame in green and blue alone if its `red_contrast` shows that red lags, else as it is."""
-    if contrast is None or contrast[0] > _MIDDLE:
+    if contrast is None or contrast[0] > COLOUR.middle:
         return frame
     if frame.mosaic is not None:
         return replace(frame, mosaic=replace(frame.mosaic, gains=(_LEFT_OUT, 1.0, _LEFT_OUT)), red_contrast=contrast)
@@ -88,24 +79,30 @@ def red_contrast(frame: Frame, share: float = 1.0, noise: RowNoise | None = None
         )
     if share < 1 and frame.colours.first_rows is not None:
         of_part = _contrast(frame.colours.first_rows(share))
-        if of_part is not None and of_part[0] > _PLAINLY:
+        if of_part is not None and of_part[0] > COLOUR.plainly:
             return of_part
     return _contrast(frame.colours.thinned())
 
 
 def _contrast(thinned: NDArray[np.floating], noise: RowNoise | None = None) -> tuple[float, float] | None:
-    if thinned.shape[1] < _N_CELLS or len(thinned) < 2:
+    if thinned.shape[1] < COLOUR.n_cells or len(thinned) < 2:
         return None
     import cv2
 
-    cells = cv2.resize(thinned, (_N_CELLS, len(thinned)), interpolation=cv2.INTER_AREA)
+    cells = cv2.resize(thinned, (COLOUR.n_cells, len(thinned)), interpolation=cv2.INTER_AREA)
     if noise is not None:
-        x, by_colour = (np.arange(_N_CELLS) + 0.5) / _N_CELLS - 0.5, np.asarray(cells.T, np.float32, order="C")
+        x, by_colour = (
+            (np.arange(COLOUR.n_cells) + 0.5) / COLOUR.n_cells - 0.5,
+            np.asarray(cells.T, np.float32, order="C"),
+        )
         cells = np.stack([noise.removed(colour, x) for colour in by_colour]).T
     mean, step = (cells[1:] + cells[:-1]) / 2, np.diff(cells, axis=0)
-    red, green = step[..., 0] / np.maximum(mean[..., 0], _DARK), step[..., 1] / np.maximum(mean[..., 1], _DARK)
+    red, green = (
+        step[..., 0] / np.maximum(mean[..., 0], COLOUR.dark),
+        step[..., 1] / np.maximum(mean[..., 1], COLOUR.dark),
+    )
     faintest, brightest = mean[..., :2].min(axis=-1), np.maximum(cells[1:], cells[:-1]).max(axis=-1)
-    weight = np.square(faintest) * (faintest > _DARK) * (brightest < _CLIPPED)
+    weight = np.square(faintest) * (faintest > COLOUR.dark) * (brightest < COLOUR.clipped)
     beside = np.zeros_like(green)
     beside[:, 1:] += green[:, :-1]
     beside[:, :-1] += green[:, 1:]
@@ -115,15 +112,15 @@ def _contrast(thinned: NDArray[np.floating], noise: RowNoise | None = None) -> t
         return None
     contrast = float(shared.sum()) / total
     error = float(np.sqrt(np.square(shared - contrast * own).sum())) / total
-    return (contrast, error) if _MIDDLE + abs(contrast - _MIDDLE) > _SURE * error else None
+    return (contrast, error) if COLOUR.middle + abs(contrast - COLOUR.middle) > COLOUR.sure * error else None
 
 
 def _thinned(frame: Frame, mosaic: Mosaic) -> Float32Array:
     """(rows, cells, 3) mean of every colour of a mosaic, in cells of one period's rows, 0 black to 1 white."""
     period, width = mosaic.pattern.shape
-    n_rows, n_pixels = frame.height // period, max(_CELL_PX // width, 1) * width
+    n_rows, n_pixels = frame.height // period, max(COLOUR.cell_px // width, 1) * width
     cells = []
-    for left in np.linspace(0, (frame.width - n_pixels) // width, _N_CELLS).astype(int) * width:
+    for left in np.linspace(0, (frame.width - n_pixels) // width, COLOUR.n_cells).astype(int) * width:
         part = frame.pixels[: n_rows * period, left : left + n_pixels].reshape(n_rows, period, -1, width)
         by_place = part.mean(axis=2, dtype=np.float32)
         cells.append([by_place[:, mosaic.pattern == colour].mean(axis=1) for colour in range(3)])

@@ -16,23 +16,8 @@ import numpy as np
 from rxcli.numerics import NORMAL_MEDIAN, TINY, local_mean, peak_offset
 from rxcli.receiver.plane.read import running_sums
 from rxcli.receiver.plane.rows import encode, light_of
+from rxcli.receiver.plane.settings import ROW_NOISE
 from rxcli.types import Float32Array, FloatArray, LightPlane
-
-#: Cells across a picture, and their width in pixels.
-_N_CELLS, _CELL_PX = 96, 12
-#: Rows over which octaves of changes reach, and over which the light of a cell is level.
-_OCTAVES, _LEVEL_ROWS = (1, 3, 7, 15, 31), 95
-#: Share of a row's changes that all cells have in common where rows are noisy, and share of the rows, in the middle of
-#: the picture, where it is looked for: they are never bent.
-_NOISY, _MIDDLE = 0.18, 0.1
-#: Cells that are worth one whose slots are independent of all others; part of the slots' power that columns share.
-_CELLS_A_COLUMN, _COMMON = 5.0, 0.2
-#: Distance of rows whose noise has nothing in common, and correlation at it from which light is no noise.
-_DISTANCE, _WHITE = 3, 0.3
-#: Rounds of weighting; largest gain of the noise, where a tone curve raises it; least power of a cell, of the usual.
-_ROUNDS, _MAX_GAIN, _LEAST = 4, 3.0, 0.01
-#: Distances of cells that are compared for the bend of rows, lags in rows, bands, and least correlation at a lag.
-_STEPS, _LAGS, _BANDS, _MIN_CORRELATION = (1, 4, 16), 6, 16, 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,47 +39,47 @@ class RowNoise:
         import cv2
 
         rows, out = np.arange(self.light.size), np.empty_like(light)
-        for some in (slice(start, start + _N_CELLS) for start in range(0, len(x), _N_CELLS)):
+        for some in (slice(start, start + ROW_NOISE.n_cells) for start in range(0, len(x), ROW_NOISE.n_cells)):
             places, shown = _sensor_rows(x[some], rows.size, self.curvature), light[some]
             noise = np.stack([np.interp(place, rows, self.light) for place in places]).astype(np.float32)
             if noise.shape != shown.shape:
                 noise = np.asarray(cv2.resize(noise, shown.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
-            change = shown - local_mean(shown, _OCTAVES[-1])
+            change = shown - local_mean(shown, ROW_NOISE.octaves[-1])
             # Light that is cut off at black does not follow, light that a tone curve raises does more.
             gain = np.einsum("nr,nr->n", change, noise) / np.maximum(np.einsum("nr,nr->n", noise, noise), TINY)
-            noise *= np.clip(gain, 0, _MAX_GAIN)[:, None]
+            noise *= np.clip(gain, 0, ROW_NOISE.max_gain)[:, None]
             np.subtract(shown, noise, out=out[some])
         return out
 
 
 def find_row_noise(plane: LightPlane) -> RowNoise | None:
     """The noise of a picture's rows, if there is so much that cells have it in common."""
-    width, n_cells = max(_CELL_PX // plane.cell_px, 1), len(plane.sums) - 1
-    if n_cells < width or plane.height < 2 * _BANDS * _OCTAVES[-1]:
+    width, n_cells = max(ROW_NOISE.cell_px // plane.cell_px, 1), len(plane.sums) - 1
+    if n_cells < width or plane.height < 2 * ROW_NOISE.bands * ROW_NOISE.octaves[-1]:
         return None
-    left = np.linspace(0, n_cells - width, _N_CELLS).astype(int)
+    left = np.linspace(0, n_cells - width, ROW_NOISE.n_cells).astype(int)
 
     def cells(left: FloatArray, rows: slice) -> Float32Array:
         sums = plane.sums[left + width, rows] - plane.sums[left, rows]
         return light_of(plane, sums / np.float32(width * plane.cell_px), "srgb")
 
-    middle = [int(plane.height * (1 + part) / 2) for part in (-_MIDDLE, _MIDDLE)]
+    middle = [int(plane.height * (1 + part) / 2) for part in (-ROW_NOISE.middle, ROW_NOISE.middle)]
     some = cells(left[::2], slice(*middle))
     change = some[:, 1:-1] - (some[:, 2:] + some[:, :-2]) / 2
     change /= change.std(axis=1, keepdims=True) + np.float32(TINY)
-    if change.mean(axis=0).var() < _NOISY:
+    if change.mean(axis=0).var() < ROW_NOISE.noisy:
         return None
     x, light = (left + width / 2) / n_cells - 0.5, cells(left, slice(None))
     curvature = _curvature(light, x)
     light = _straight(light, x, curvature)
-    level = np.maximum(local_mean(light, _LEVEL_ROWS), 0)
-    widths = [light, *(local_mean(light, width) for width in _OCTAVES[1:])]
+    level = np.maximum(local_mean(light, ROW_NOISE.level_rows), 0)
+    widths = [light, *(local_mean(light, width) for width in ROW_NOISE.octaves[1:])]
     offset = sum(
         (_offset(fine - coarse, level) for fine, coarse in pairwise(widths)), np.zeros(plane.height, np.float32)
     )
     # Slots that all columns share last for rows; noise does not.
-    is_white = float(offset[_DISTANCE:] @ offset[:-_DISTANCE]) < _WHITE * float(offset @ offset)
-    return RowNoise(offset, curvature) if is_white else None
+    shared = float(offset[ROW_NOISE.distance :] @ offset[: -ROW_NOISE.distance])
+    return RowNoise(offset, curvature) if shared < ROW_NOISE.white * float(offset @ offset) else None
 
 
 def without_row_noise(plane: LightPlane, noise: RowNoise) -> LightPlane:
@@ -129,21 +114,22 @@ def _straight(light: Float32Array, x: FloatArray, curvature: FloatArray) -> Floa
 
 def _curvature(light: Float32Array, x: FloatArray) -> FloatArray:
     """(5,) bends by which cells (N, R) at x differ in their sensor rows; those under which they have most in common."""
-    length = light.shape[1] // _BANDS
-    terms, curvature = _bends(x, light.shape[1])[..., length // 2 :: length][..., :_BANDS], np.zeros(5)
+    n_bands, lags = ROW_NOISE.bands, ROW_NOISE.lags
+    length = light.shape[1] // n_bands
+    terms, curvature = _bends(x, light.shape[1])[..., length // 2 :: length][..., :n_bands], np.zeros(5)
     found = []
-    for step in (*_STEPS, 1):
+    for step in (*ROW_NOISE.steps, 1):
         straight = _straight(light, x, curvature)
-        change = straight - local_mean(straight, _OCTAVES[-1])
+        change = straight - local_mean(straight, ROW_NOISE.octaves[-1])
         change /= change.std(axis=1, keepdims=True) + np.float32(TINY)
         found.append((float(change.mean(axis=0).var()), curvature))
-        products = (change[:-step] * np.roll(change[step:], lag, axis=1) for lag in range(-_LAGS, _LAGS + 1))
-        by_band = [each[:, : length * _BANDS].reshape(len(each), _BANDS, length).mean(axis=2) for each in products]
+        products = (change[:-step] * np.roll(change[step:], lag, axis=1) for lag in range(-lags, lags + 1))
+        by_band = [each[:, : length * n_bands].reshape(len(each), n_bands, length).mean(axis=2) for each in products]
         similarity = np.stack(by_band)
         top = similarity[1:-1].argmax(axis=0)[None] + 1
         before, peak, after = (np.take_along_axis(similarity, top + shift, axis=0)[0] for shift in (-1, 0, 1))
-        lag = top[0] - _LAGS + peak_offset(before, peak, after)
-        weight = (np.maximum(peak - _MIN_CORRELATION, 0) * (peak > np.maximum(before, after))).ravel()
+        lag = top[0] - lags + peak_offset(before, peak, after)
+        weight = (np.maximum(peak - ROW_NOISE.min_correlation, 0) * (peak > np.maximum(before, after))).ravel()
         jacobian = (terms[:, step:] - terms[:, :-step]).reshape(5, -1)
         normal = (jacobian * weight) @ jacobian.T
         curvature = curvature + np.linalg.solve(normal + TINY * np.eye(5), jacobian @ (weight * lag.ravel()))
@@ -154,13 +140,13 @@ def _offset(change: Float32Array, level: Float32Array) -> Float32Array:
     """(R,) offset that changes (N, R) share beside the share of their own light."""
     bright = np.maximum(np.square(level), np.float32(TINY))
     offset, gain = np.zeros(change.shape[1], np.float32), np.ones((len(change), 1), np.float32)
-    for step in range(_ROUNDS):
-        left = local_mean(np.square(change - gain * offset), _LEVEL_ROWS)
+    for step in range(ROW_NOISE.rounds):
+        left = local_mean(np.square(change - gain * offset), ROW_NOISE.level_rows)
         usual = float(np.median(left))
         # Cells without light have no noise of their own to be weighted by.
-        power = left + np.float32(_LEAST * usual + TINY) if step else np.full_like(left, usual + TINY)
-        common = 1 / (np.float32(_COMMON) * np.quantile(power / bright, 0.1))
-        power *= np.float32(_CELLS_A_COLUMN)
+        power = left + np.float32(ROW_NOISE.min_power * usual + TINY) if step else np.full_like(left, usual + TINY)
+        common = 1 / (np.float32(ROW_NOISE.common) * np.quantile(power / bright, 0.1))
+        power *= np.float32(ROW_NOISE.cells_a_column)
         weighted, shares = gain / power, level / power
         ones, mixed = (gain * weighted).sum(axis=0), (level * weighted).sum(axis=0)
         second = (shares * level).sum(axis=0) + common
@@ -172,5 +158,5 @@ def _offset(change: Float32Array, level: Float32Array) -> Float32Array:
             return np.zeros_like(error)
         offset = np.asarray(offset * (noise / (noise + error)), np.float32)
         followed = change @ offset / max(float(offset @ offset), TINY)
-        gain = np.asarray(np.clip(followed, 0, _MAX_GAIN), np.float32)[:, None]
+        gain = np.asarray(np.clip(followed, 0, ROW_NOISE.max_gain), np.float32)[:, None]
     return offset
