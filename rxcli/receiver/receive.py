@@ -31,7 +31,6 @@ from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.outlines import no_screen, proposed_screens, too_small
 from rxcli.receiver.search.propose import USUAL_COLUMNS, nearest_screen
 from rxcli.receiver.search.refusal import STEADY_LIGHT
-from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Frame, FrameResult, FrameSoftBits, OnTaps
@@ -180,8 +179,6 @@ def _with_cut_packets(cache: FrameCache, received: Received, options: ReceiverOp
     result, known = received.result, known_camera(cache.frame, options)
     own, is_steady = result.soft_bits, STEADY_LIGHT in (result.message or "")
     if not options.soft_bits or received.n_believable or is_steady or isinstance(known, Failure):
-        return own
-    if known and own and result.search[-1].evidence > SETTINGS.plain_estimate:
         return own
     screens = proposed_screens(cache, options)
     if isinstance(screens, Failure):

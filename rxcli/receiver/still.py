@@ -66,7 +66,14 @@ def _may_show_packets(initial: Reception) -> bool:
     return packet_llr(initial) + max(float(initial.posteriors.header_llr.sum()), 0.0) > SETTINGS.min_packets_llr
 
 
-def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception, *, adds_up: bool = False) -> Reception:
+def decode(
+    acquisition: Acquisition,
+    skip: frozenset[str],
+    initial: Reception,
+    *,
+    adds_up: bool = False,
+    keeps_weights: bool = False,
+) -> Reception:
     """Make a further pass over doubtful columns, which uses more of the light and replaces the result.
 
     Args:
@@ -74,6 +81,7 @@ def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception, *
         skip: enabled shortcuts, see `rxcli.options.SKIPS`.
         initial: the initial pass.
         adds_up: whether the metrics are to be added to those of other frames.
+        keeps_weights: whether the weights of the initial pass are known.
     """
     reception = initial = _with_tails(acquisition, initial)
     n_columns = len(initial.snr)
@@ -89,7 +97,7 @@ def decode(acquisition: Acquisition, skip: frozenset[str], initial: Reception, *
         if (doubtful := np.intersect1d(lit, doubtful_columns(reception))).size:
             reception, _ = without_row_noise(acquisition, reception, doubtful)
     elif lit.size:
-        reception = follow_picture(acquisition, reception, lit)
+        reception = follow_picture(acquisition, reception, lit, keeps_weights=keeps_weights)
     return replace(reception, skipped={name: count for name, count in skipped.items() if count})
 
 
@@ -107,8 +115,13 @@ def _with_tails(acquisition: Acquisition, initial: Reception) -> Reception:
     return replace(_with_metrics(initial, columns, found.metrics, found.snr), model=model)
 
 
-def initial_pass(acquisition: Acquisition) -> Reception:
-    """Make a pass over strips binned in pairs, from an initial estimate of the slots."""
+def initial_pass(acquisition: Acquisition, room_light: float = 1.0) -> Reception:
+    """Make a pass over strips binned in pairs, from an initial estimate of the slots.
+
+    Args:
+        acquisition: the clock and the row profiles.
+        room_light: that is assumed where no header is in view, relative to its estimate.
+    """
     acquisition = replace(acquisition, profiles=acquisition.binned)
     clock = acquisition.clock
     if clock.exposure_slots > LONG_EXPOSURE_SLOTS:
@@ -117,7 +130,7 @@ def initial_pass(acquisition: Acquisition) -> Reception:
     exposure_slots = float(np.hypot(clock.exposure_slots, 1 / clock.rows_per_slot))
     clock = replace(clock, exposure_slots=exposure_slots)
     samples = sync.sample_slots(acquisition.profiles, clock, STILL.coarse_samples)
-    model = _light_model(acquisition, clock, samples)
+    model = _light_model(acquisition, clock, samples, room_light)
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
     metrics = channel.initial_metrics(*contrast, model.exposure)
     clock = in_bursts(acquisition, clock, metrics)
@@ -235,7 +248,9 @@ def llr_of(lit: Float32Array) -> Float32Array:
     return np.asarray(np.log(bounded) - np.log1p(-bounded), np.float32)
 
 
-def follow_picture(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
+def follow_picture(
+    acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64], *, keeps_weights: bool = False
+) -> Reception:
     """Detect slots and picture of some columns jointly, with all strips, given the slots decided so far."""
     clock, q = reception.clock, STILL.coarse_samples
     if reception.is_long:
@@ -247,7 +262,7 @@ def follow_picture(acquisition: Acquisition, reception: Reception, columns: NDAr
     if not reception.is_long:
         # Paths that see nothing of a packet's start would keep the weights of fewest words.
         dimming = reception.n_observed[:, columns, SLOTS_PER_SYMBOL:PREAMBLE_SLOTS].sum(axis=2, keepdims=True)
-        least = np.where(dimming > 0, STILL.min_weight_log_prior, STILL.no_weight)
+        least = np.where((dimming > 0) & (not keeps_weights), STILL.min_weight_log_prior, STILL.no_weight)
         bursts = _with_weights(bursts, reception.posteriors.w_log_prob[columns], least)
     found = survivors.detect(bursts)
     header_llr, log_prob = reception.posteriors.header_llr[:, columns], found.log_prob
@@ -441,13 +456,15 @@ def detected(metrics: FloatArray, clock: Clock, weight_margin: float = SETTINGS.
     return detect.detect(bursts, detect.plausible_weights(bursts, weight_margin))
 
 
-def _light_model(acquisition: Acquisition, clock: Clock, samples: SlotSamples) -> channel.ObservationModel:
+def _light_model(
+    acquisition: Acquisition, clock: Clock, samples: SlotSamples, room_light: float = 1.0
+) -> channel.ObservationModel:
     profiles = acquisition.profiles
     rows = _rows_per_sample(clock, samples.samples_per_slot)
     min_sigma = 0.5 * noise_of(profiles) / rows**0.5
     black_level = channel.estimate_black_level(samples, clock)
     if black_level is None:
-        black_level = _darkest(samples, min_sigma)
+        black_level = room_light * _darkest(samples, min_sigma)
     sigma = dark_sigma(samples.light, samples.valid, black_level, min_sigma)
     return channel.ObservationModel(
         black_level=black_level,

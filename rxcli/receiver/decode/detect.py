@@ -355,3 +355,19 @@ def plausible_weights(metrics: FloatArray, margin: float, llr: Float32Array | No
     # Each metric was counted once for every slot that it covers.
     lead = margin * (_isi_memory_of(metrics) + 1) / 2
     return np.asarray(score >= score.max(axis=1, keepdims=True) - lead)
+
+
+def common_weights(w_log_prob: FloatArray) -> NDArray[np.bool_]:
+    """(C, 9) the weight of every column, from log probabilities (C, 9) of columns by themselves.
+
+    Columns of most screens have the same weight, and where no dimming symbol is in view it is known by the words alone.
+    So the shares of all weights in the columns are the prior of each column.
+    """
+    own = SETTINGS.weight_temper * w_log_prob
+    shares = np.full(len(WEIGHTS), 1 / len(WEIGHTS))
+    for _ in range(SETTINGS.weight_rounds):
+        posterior = own + np.log(shares)
+        posterior = np.exp(posterior - np.logaddexp.reduce(posterior, axis=1, keepdims=True))
+        shares = posterior.sum(axis=0) + SETTINGS.other_weights
+        shares /= shares.sum()
+    return np.asarray(posterior == posterior.max(axis=1, keepdims=True))

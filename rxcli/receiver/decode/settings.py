@@ -17,6 +17,11 @@ class DecodeSettings:
     min_best_confidence: float = 0.1
     #: Minimum probability of a weight at which its soft bits are used.
     min_weight_probability: float = 0.99
+    #: Weights that columns have in common: weight of evidence, because errors of samples are correlated; number of
+    #: columns of each weight that are assumed beside those in view; and rounds of estimating the shares.
+    weight_temper: float = 0.08
+    other_weights: float = 0.1
+    weight_rounds: int = 20
     #: A column below this signal-to-noise ratio, dB, is too dark to try.
     dark_snr_db: float = 0.0
     #: Minimum log-likelihood ratio of a column's headers, all bursts together, against arbitrary slots.

@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.receiver import channel
 from rxcli.receiver.camera.settings import SETTINGS as CAMERA
+from rxcli.receiver.decode import detect
 from rxcli.receiver.frame.acquisition import Acquisition, distinct_screens, noise_of
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception, dark_columns, soft_bits
@@ -157,8 +159,24 @@ def _soft_bits(candidate: _Candidate) -> FrameSoftBits:
         likeliest = max(starts, key=evidence.log_evidence)
         is_open = evidence.log_evidence(likeliest) < evidence.log_evidence(initial) + SETTINGS.cut_start
         best = initial if is_open else likeliest
-    reception = decode(acquisition, _SKIP, best)
+    ways = [_of_common_weights(best)]
+    if is_open:
+        ways += [_of_common_weights(initial_pass(acquisition, share)) for share in SETTINGS.cut_room_lights[1:]]
+    reception = decode(acquisition, _SKIP, max(ways, key=_n_certain), keeps_weights=True)
     return replace(soft_bits(candidate.context.frame, reception, dark_columns(reception.snr)), open_start=is_open)
+
+
+def _n_certain(initial: Reception) -> float:
+    """Bits that are expected to be right beyond chance, of columns with the commonest weight."""
+    common = initial.posteriors.w == np.bincount(initial.posteriors.w).argmax()
+    return float(np.tanh(np.abs(np.nan_to_num(initial.posteriors.bit_llr[:, common])) / 2).sum())
+
+
+def _of_common_weights(initial: Reception) -> Reception:
+    """The initial pass with the weights that columns have in common."""
+    bursts = channel.by_burst(initial.metrics, initial.clock)
+    weights = detect.common_weights(detect.detect(bursts).w_log_prob)
+    return replace(initial, posteriors=detect.detect(bursts, weights))
 
 
 def _refined(acquisition: Acquisition) -> Iterator[tuple[Acquisition, Reception]]:

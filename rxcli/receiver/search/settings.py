@@ -66,6 +66,8 @@ class SearchSettings:
     max_cut: int = 4
     same_symbols_slots: float = 0.6
     cut_start: float = 10.0
+    #: Room light that is tried where no header is in view, relative to its estimate, which counts what is lit in part.
+    cut_room_lights: tuple[float, ...] = (1.0, 0.8, 0.6)
     #: Natural logarithm of the ratio of exposures, stated and by the width of stripes, up to which they may agree.
     near_exposures: float = 0.7
 

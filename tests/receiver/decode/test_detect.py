@@ -18,6 +18,7 @@ from rxcli.protocol import (
 )
 from rxcli.receiver.channel import metrics_of
 from rxcli.receiver.decode.detect import (
+    common_weights,
     detect,
     plausible_weights,
     slot_margin,
@@ -276,3 +277,28 @@ def test_ratios_of_slots_by_brute_force(isi_memory: int) -> None:
     for slot in range(isi_memory, n - isi_memory):
         lit_there, dark_there = (np.where(np.arange(n) == slot, state, slots) for state in (1, 0))
         assert found[slot] == pytest.approx(total(lit_there) - total(dark_there), abs=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("alone", "common"),
+    [
+        ({2: 4}, {}),  # Words alone spoke for a neighbouring weight in one column.
+        ({2: 4, 5: 6, 7: 2}, {}),
+        (dict.fromkeys(range(0, 20, 2), 3), dict.fromkeys(range(0, 20, 2), 3)),  # Half of the columns differ.
+    ],
+)
+def test_columns_have_weights_in_common(alone: dict[int, int], common: dict[int, int]) -> None:
+    w_log_prob = np.full((20, 9), -60.0)
+    for column in range(20):
+        w_log_prob[column, 4] = -20.0
+        w_log_prob[column, alone.get(column, 5) - 1] = 0.0
+    found = common_weights(w_log_prob)
+    assert found.sum(axis=1).tolist() == [1] * 20
+    assert (found.argmax(axis=1) + 1).tolist() == [common.get(column, 5) for column in range(20)]
+
+
+def test_a_weight_of_its_own_that_is_beyond_doubt_stays() -> None:
+    w_log_prob = np.full((20, 9), -120.0)
+    w_log_prob[:, 4] = 0.0
+    w_log_prob[3] = [-120, -120, 0, -120, -120, -120, -120, -120, -120]
+    assert (common_weights(w_log_prob).argmax(axis=1) + 1).tolist() == [5, 5, 5, 3, *[5] * 16]
