@@ -43,7 +43,7 @@ def least_squares(
         residual: state (p,) to residual (n,).
         start: (p,) initial state.
         jacobian: state to (n, p) derivative of the residual; None: central differences.
-        options: further arguments of `scipy.optimize.least_squares`, such as a robust loss.
+        options: further arguments of `scipy.optimize.least_squares`, such as `max_nfev`.
     """
     from scipy.optimize import least_squares as solve
 

@@ -77,7 +77,7 @@ class PeriodicFit:
         """
         richer = self if self.n_parameters >= rival.n_parameters else rival
         ours, theirs = (float(fit.residual @ fit.residual) + 1e-300 for fit in (self, rival))
-        gain = float(np.log(theirs / ours)) * _independent(richer.residual)
+        gain = float(np.log(theirs / ours)) * _n_independent(richer.residual)
         return gain > (self.n_parameters - rival.n_parameters) * float(np.log(self.mean.size))
 
     def waveform(self, rows: FloatArray) -> FloatArray:
@@ -305,7 +305,7 @@ def scatter_sd(influence: FloatArray, profiles: FloatArray) -> float:
     return float(np.std(parts, ddof=1) / np.sqrt(parts.size) * widening)
 
 
-def _independent(residual: FloatArray) -> float:
+def _n_independent(residual: FloatArray) -> float:
     """Number of independent values in `residual` (Bartlett).
 
     Its autocorrelation counts up to where it first vanishes: beyond, a harmonic not yet fitted would pass for noise

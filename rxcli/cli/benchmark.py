@@ -8,6 +8,7 @@ import msgspec
 
 from rxcli.cli.common import options
 from rxcli.cli.groups import SuggestingGroup
+from rxcli.cli.kinds import FOLDER
 from rxcli.errors import ExitCode
 from rxcli.lab.benchmark import compare as checkouts
 from rxcli.lab.benchmark import measures, tables
@@ -19,7 +20,7 @@ from rxcli.outputs import claim_own_folder, write_whole
 _COUNT = click.IntRange(1)
 _FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-_OUT = ("--out", click.Path(file_okay=False, path_type=Path), Path("benchmark-results"), "Folder of results.")
+_OUT = ("--out", FOLDER, Path("benchmark-results"), "Folder of results.")
 _SEED = ("--seed", click.IntRange(0, 10**6), 0, "Of all random scenes.")
 _COUNTED = ("--count", _COUNT, None, "Numbers to draw at each point.  [default: the scenario's]")
 _CAPTURES = ("--folder captures", _FOLDER, None, "Of `captures` and `files`: where they lie.  [default: the samples]")
@@ -54,7 +55,7 @@ class _Scenarios(SuggestingGroup):
 _RECEPTION = (
     ("--way ways", [str], None, "A way to receive in place of the scenario's; may be given several times."),
     ("--cae", ("auto", "always", "never"), None, "When the auto-encoder runs."),
-    ("--save", click.Path(file_okay=False, path_type=Path), None, "Also write the drawn captures into this folder."),
+    ("--save", FOLDER, None, "Also write the drawn captures into this folder."),
     ("--also journals", [_FILE], None, "Count an earlier run's packets in the bins, too; may be given several times."),
 )
 

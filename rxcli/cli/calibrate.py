@@ -19,6 +19,7 @@ from rxcli.calibrate.shutter import ShutterCalibration, calibrate_shutter
 from rxcli.calibrate.slots import calibrate_slots
 from rxcli.cli.common import force_argument, json_output, options, write_json
 from rxcli.cli.groups import SuggestingGroup
+from rxcli.cli.kinds import FILE
 from rxcli.errors import InputError, UsageError
 from rxcli.ingest import KNOWN_SUFFIXES, open_source
 from rxcli.outputs import CAMERA, PICTURE, Output, claim
@@ -28,13 +29,12 @@ from rxcli.results.undistort import grey_levels
 from rxcli.runs.batch import collect_sources
 from rxcli.types import Frame, Metadata
 
-_FILE = click.Path(dir_okay=False, path_type=Path)
 _PATH = click.Path(path_type=Path)
 _PATHS = click.argument("paths", nargs=-1, required=True, type=_PATH)
 _NAME_HINT = "use letters, digits, dots, dashes and underscores"
 #: Where the result goes: the options that `_Results` takes.
 _RESULTS = (
-    ("--save", _FILE, None, "Camera profile to write, or to add to."),
+    ("--save", FILE, None, "Camera profile to write, or to add to."),
     ("--name", str, None, "Keep it as the camera NAME, for --camera NAME from anywhere."),
     ("--json=FILE|- json_path", click.Path(allow_dash=True), None, "Write the result as JSON."),
 )
@@ -174,7 +174,7 @@ class _BoardReader:
     ("--charuco=DICT dictionary", str, None, "ChArUco board of this dictionary (DICT_5X5_100, ...)."),
     ("--marker marker_ratio", float, 0.75, "Marker over square side."),
     ("--every", click.IntRange(1), 10, "Use every Nth frame of a clip."),
-    ("--picture", _FILE, None, "Draw the residuals into this PNG."),
+    ("--picture", FILE, None, "Draw the residuals into this PNG."),
     *_RESULTS,
 )
 @force_argument

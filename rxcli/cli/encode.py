@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.cli.common import force_argument, options, refuse
-from rxcli.cli.kinds import FILE
+from rxcli.cli.kinds import FILE, POSITIVE
 from rxcli.cli.sending import LIGHT, raw_sending, sending_of
 from rxcli.errors import InputError, UsageError
 from rxcli.link.encoder import (
@@ -53,7 +53,7 @@ _OUT_HELP = "Where to write: .npy or .csv; slots also as .bin, .h or .vcd; - for
     ("--screen", str, "data-34k6", "Screen profile: a name or a TOML file."),
     ("--out", click.Path(dir_okay=False, path_type=Path), None, _OUT_HELP, {"required": True}),
     ("--bursts", click.IntRange(1), None, "How many bursts. [default: what a receiver needs, and more]"),
-    ("--seconds", click.FloatRange(0, min_open=True), None, "How much time of the link, instead."),
+    ("--seconds", POSITIVE, None, "How much time of the link, instead."),
     ("--slots", None, False, "Write the slots themselves instead of labels; so do --payload, .bin, .h and .vcd."),
     ("--truth", FILE, None, "Also write what is sent (JSON), for decode --truth."),
     ("--weights", str, "5", "Lit slots of ten: N, a list N,N,..., or a JSON file per burst."),
@@ -105,8 +105,9 @@ def _plan(path: Path | None, screen: ScreenProfile, options: dict[str, Any]) -> 
         n_bursts = _n_bursts(options, sending, screen)
         weights = _weights(options["weights"], n_bursts, screen.columns)
     else:
-        if any(value is not None for value in given):
-            raise UsageError("--payload excludes PATH, --text and --uri", "give one of them")
+        refuse(
+            (any(value is not None for value in given), "--payload excludes PATH, --text and --uri", "give one of them")
+        )
         weights = _weights(options["weights"], 1, screen.columns)
         sending = raw_sending(options["payload"], weights[0], options["seed"], options["same"])
         n_bursts = _n_bursts(options, sending, screen)

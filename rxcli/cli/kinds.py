@@ -8,7 +8,7 @@ import click
 from click.shell_completion import CompletionItem
 
 AUTO = "auto"
-SHARE = click.FloatRange(0, 1)
+SHARE, POSITIVE = click.FloatRange(0, 1), click.FloatRange(0, min_open=True)
 FILE = click.Path(dir_okay=False, path_type=Path, allow_dash=False)
 FOLDER = click.Path(file_okay=False, path_type=Path)
 

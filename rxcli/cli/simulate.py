@@ -13,7 +13,7 @@ import numpy as np
 
 from rxcli import outputs
 from rxcli.cli.common import force_argument, options
-from rxcli.cli.kinds import FILE, FOLDER, Exposure
+from rxcli.cli.kinds import FILE, FOLDER, POSITIVE, Exposure
 from rxcli.cli.printing import with_progress
 from rxcli.cli.sending import payload_bytes, sending_of
 from rxcli.errors import UsageError
@@ -21,9 +21,8 @@ from rxcli.lab.simulate.capture import Recording, prepare, write_capture
 from rxcli.lab.simulate.files import CODECS
 from rxcli.lab.simulate.pictures import picture_names
 from rxcli.lab.simulate.scenes import PRESETS, Scene, preset, with_fields
-from rxcli.lab.simulate.transmitter import PICTURE_FILES, Waveform, Weights, export_picture
+from rxcli.lab.simulate.transmitter import PICTURE_FILES, Weights, export_picture
 from rxcli.lab.simulate.truth import build_camera_profile, truth_path, write_truth
-from rxcli.link.encoder import Sending
 from rxcli.link.slots import read_slots, write_slots
 from rxcli.profiles import ScreenProfile, dump_profile
 
@@ -53,13 +52,8 @@ _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_ra
     ("--format=NAME file_format", _FORMATS, None, f"Format of OUT, {', '.join(_FORMATS)}. [default: by its suffix]"),
     ("--w weights", str, "5", "Lit slots of ten: N, a list N,N,..., or 'dimming'."),
     ("--exposure exposure_s", Exposure(), None, "Exposure in seconds, or as 1/32000.  [default: the preset's]"),
-    (
-        "--exposure-slots",
-        click.FloatRange(0, min_open=True),
-        None,
-        "Exposure in slots; the gain follows, as in camera apps.",
-    ),
-    ("--readout readout_s", click.FloatRange(0, min_open=True), None, "Seconds in which all rows are read."),
+    ("--exposure-slots", POSITIVE, None, "Exposure in slots; the gain follows, as in camera apps."),
+    ("--readout readout_s", POSITIVE, None, "Seconds in which all rows are read."),
     ("--electrons", float, None, "Electrons of a green pixel that sees white, in one exposure."),
     ("--roll roll_deg", float, None, "Degrees about the line of sight; 180 for a camera upside down."),
     ("--fill", float, None, "Share of the picture's width that the screen fills, instead of a distance."),
@@ -140,10 +134,8 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
     scene = preset(options["preset"], options["screen"])
     for text in options["fields"]:
         scene = with_fields(scene, _table(text))
-    sent: dict[str, Any] = {"payload": payload_bytes(options["payload"]), "labels": _labels(options)}
-    if options["slots"] is not None:
-        sent["waveform"] = _waveform(options, scene.screen)
-    scene = replace(scene, w=_weights(options["weights"]), **sent, **_given(options, _SCENE_OPTIONS))
+    sent, given = _sent(options, scene.screen), _given(options, _SCENE_OPTIONS)
+    scene = replace(scene, w=_weights(options["weights"]), **sent, **given)
     scene = _with_pose(scene, options)
     if options["readout_s"] is not None:
         scene = scene.read_in(options["readout_s"])
@@ -161,12 +153,17 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
     return _for_format(scene, file_format)
 
 
-def _waveform(options: dict[str, Any], screen: ScreenProfile) -> Waveform:
-    """The light that a file of slots drives."""
-    if options["payload"] != "random" or _given(options, ("text", "uri", "file_path")):
-        raise UsageError("--slots excludes --payload, --text, --uri and --file", "give one of them")
-    slots = read_slots(options["slots"], screen).T.astype(np.float64)
-    return lambda slot: slots[:, slot.astype(np.int64) % slots.shape[1]]
+def _sent(options: dict[str, Any], screen: ScreenProfile) -> dict[str, Any]:
+    """What the screen sends: the light of a file of slots, what the link layer sends, or payload as it is."""
+    given = _given(options, ("file_path", "text", "uri", "slots"))
+    if len(given) + (options["payload"] != "random") > 1:
+        raise UsageError("--payload, --text, --uri, --file and --slots exclude each other", "give one of them")
+    if "slots" in given:
+        slots = read_slots(given["slots"], screen).T.astype(np.float64)
+        return {"waveform": lambda slot: slots[:, slot.astype(np.int64) % slots.shape[1]]}
+    if given:
+        return {"labels": sending_of(options["file_path"], options["text"], options["uri"])}
+    return {"payload": payload_bytes(options["payload"])}
 
 
 def _table(text: str) -> dict[str, Any]:
@@ -227,16 +224,6 @@ def _weights(text: str) -> Weights:
     except ValueError:
         raise UsageError(f"--w: {text!r} is no weight", "give 1..9, a list of them, or 'dimming'") from None
     return values[0] if len(values) == 1 else values
-
-
-def _labels(options: dict[str, Any]) -> Sending | None:
-    """What the link layer sends; None for payload as it is."""
-    given = _given(options, ("text", "uri", "file_path"))
-    if not given:
-        return None
-    if len(given) > 1 or options["payload"] != "random":
-        raise UsageError("--payload, --text, --uri and --file exclude each other", "give one of them")
-    return sending_of(options["file_path"], options["text"], options["uri"])
 
 
 def _warn_of_cut_packets(capture: Recording) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from rxcli.cli.common import options
+from rxcli.cli.kinds import FOLDER
 from rxcli.errors import UsageError
 
 #: Samples that the ranges of eight-bit integers are laid out for.
@@ -16,7 +17,7 @@ CALIBRATION_SAMPLES = 12
 
 
 @click.command()
-@click.argument("out", type=click.Path(file_okay=False, path_type=Path))
+@click.argument("out", type=FOLDER)
 @options(
     ("--name", str, "strips", "Name of the model."),
     ("--version model_version", click.IntRange(1), 1, "Its version."),
@@ -26,7 +27,7 @@ CALIBRATION_SAMPLES = 12
     ("--strip-width", click.IntRange(1), 32, "Channels of a strip."),
     ("--column-width", click.IntRange(1), 48, "Channels of a column."),
     ("--seed", click.IntRange(0), 1, "Same seed, same network."),
-    ("--cache", click.Path(file_okay=False, path_type=Path), None, "Folder of the data sets.  [default: OUT/data]"),
+    ("--cache", FOLDER, None, "Folder of the data sets.  [default: OUT/data]"),
     ("--int8/--float quantise", None, True, "Compute in eight-bit integers, or not.", {"show_default": True}),
     ("-q --quiet", None, False, "No progress bars."),
 )

@@ -90,17 +90,21 @@ class WholeFrames:
             self._shown.append((picture, frame))
 
     def _judge(self, *, is_end: bool) -> Iterator[None]:
-        """Settle which pictures are whole, as far as those decoded before are known; None for each lost one."""
+        """Settle which pictures are whole, as far as those decoded before are known; None for each lost one.
+
+        A lost or damaged picture breaks all that are decoded after it, up to the next key frame. Leading pictures are
+        decoded after a key frame and shown before it: they may need pictures from before it, and none needs them but
+        each other.
+        """
         reorder = _MAX_REORDER if self._codec.has_b_frames else 0
         while self._sent and (
             self._sent[0].place is not None or is_end or self._sent[0].number + reorder < self._newest
         ):
             picture, key = self._sent.popleft(), self._key
             if picture.place is None:
-                # Behind damage, those after a key frame that are shown before it are lost, and harm none after it.
-                led = self._was_broken and picture.number <= key.number + reorder and not picture.has_gap
+                is_leading = self._was_broken and picture.number <= key.number + reorder and not picture.has_gap
                 is_field = self._is_interlaced and 2 * self._n_shown <= self._newest + 2  # two packets make a frame
-                self._is_broken |= not (led or is_field)
+                self._is_broken |= not (is_leading or is_field)
                 if picture.number >= self._first and not is_field:
                     yield None
             elif picture.is_key:

@@ -81,6 +81,7 @@ class _Progress:
     has_fields: bool = False
 
     def damage(self, reason: str = "") -> None:
+        """Count a damaged frame; of the first one, time and reason are kept."""
         self.n_damaged += 1
         if self.broken_at_s is None:
             self.broken_at_s, self.reason = self.last_time_s, reason

@@ -465,6 +465,7 @@ class FileSearch:
         del self._recent[:-_MAX_RECENT]
 
     def _complete(self, at_last: bool) -> list[tuple[FileState, Container]]:
+        """Read the blocks that are ready, and return the files that are whole by now."""
         found = []
         for file in self.files.values():
             if not file.under_way:

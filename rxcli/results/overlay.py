@@ -53,12 +53,10 @@ def preview(frame: Frame, width_px: int = 1000) -> Preview:
     return Preview(grey_levels(frame, step), step)
 
 
-def outlines_of(
-    corners: FloatArray, n_columns: int, frame: Frame, camera: CameraProfile | None, n_strips: int = 1
-) -> Outlines:
+def outlines_of(corners: FloatArray, n_columns: int, frame: Frame, camera: CameraProfile | None) -> Outlines:
     """Outlines of the columns of a screen, along the bends of a lens that is known or estimated."""
     lens = geometry.lens_for(camera.lens, frame.width, frame.height) if camera and camera.lens else None
-    return geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height, lens)
+    return geometry.column_outlines(corners, n_columns, 1, frame.width, frame.height, lens)
 
 
 def column_polygons(

@@ -68,15 +68,12 @@ def _blocks(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _numbering(result: FrameResult) -> dict[str, Any]:
-    """What is not plain of the screen's place: sides that were inferred, and which column is which."""
-    certainty = _rounded(result.column_certainty, 4)
-    return {
-        **({"inferred_sides": list(result.inferred_sides)} if result.inferred_sides else {}),
-        **({"column_certainty": certainty} if certainty != 1 else {}),
-        **({"column_offset": None} if result.column_offset is None else {}),
-        **({"quarter_turns": result.quarter_turns} if result.quarter_turns else {}),
-        **({"mirrored": result.mirrored} if result.mirrored is not False else {}),
-    }
+    """Optional parts of a screen's place, present only where they differ from those of a screen in plain view."""
+    usual = {"inferred_sides": [], "column_certainty": 1, "column_offset": 0, "quarter_turns": 0, "mirrored": False}
+    found = {name: getattr(result, name) for name in usual}
+    found["inferred_sides"] = list(result.inferred_sides)
+    found["column_certainty"] = _rounded(result.column_certainty, 4)
+    return {name: value for name, value in found.items() if value != usual[name]}
 
 
 def _written(value: Any, digits: Mapping[str, int | None]) -> dict[str, Any]:

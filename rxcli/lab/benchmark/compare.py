@@ -10,7 +10,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,10 +90,8 @@ def compare(tasks: Sequence[Task], rival: Path, folder: Path, repeats: int, tick
 def _decoded_by(checkout: Path, jobs: Sequence[Sequence[str]]) -> list[Record]:
     """What one checkout made of every file: lines without times, packets, seconds."""
     environment = {**os.environ, **_ENVIRONMENT, "PYTHONPATH": str(checkout)}
-    command = [sys.executable, "-P", "-c", _WORKER]
-    # Elsewhere: python would look into the folder that it stands in first.
-    run = partial(subprocess.run, env=environment, capture_output=True, text=True, check=False, cwd="/")
-    done = run(command, input=json.dumps(jobs))
+    command = [sys.executable, "-P", "-c", _WORKER]  # -P: no package of the folder that it is run in
+    done = subprocess.run(command, input=json.dumps(jobs), env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         reason = done.stderr.strip().splitlines()[-1:] or [f"exit code {done.returncode}"]
         raise ReceiverError(f"{checkout}: decoding broke off ({reason[0]})", "run its own tests")

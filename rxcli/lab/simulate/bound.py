@@ -59,6 +59,7 @@ class Oracle:
         whole = (starts >= np.floor(begin)) & (starts + SLOTS_PER_SYMBOL <= np.ceil(end + exposure.exposure_slots))
         for copy, symbol in np.argwhere(whole):
             matched, own = self.about_slots(column, int(starts[copy, symbol]))
+            # `matched` is of the noise alone: the light of the symbol that was sent is added, all other light is known.
             score[symbol] += words @ (matched + own @ sent[symbol]) - 0.5 * np.einsum("ki,ij,kj->k", words, own, words)
             information[symbol] += np.trace(own)
         return np.argmax(score, axis=1), np.argmax(words @ sent.T, axis=0), information > 0

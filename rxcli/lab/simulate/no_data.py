@@ -103,11 +103,11 @@ def _rippling(rng: Generator) -> _Light:
     """A lamp: a rectified sine of the mains, a sawtooth of its driver, or switching."""
     if rng.random() < 0.5:
         return _switched(rng)
-    period, depth, sine = np.exp(rng.uniform(*np.log((6.0, 900.0)))), rng.uniform(0.1, 1.0), rng.random() < 0.6
+    period, depth, is_sine = np.exp(rng.uniform(*np.log((6.0, 900.0)))), rng.uniform(0.1, 1.0), rng.random() < 0.6
 
     def waveform(t: FloatArray) -> FloatArray:
         place = t / period
-        return np.asarray(1 - depth + depth * (np.abs(np.sin(np.pi * place)) if sine else place % 1.0))
+        return np.asarray(1 - depth + depth * (np.abs(np.sin(np.pi * place)) if is_sine else place % 1.0))
 
     return _Light(waveform, period * rng.uniform(0.02, 0.7), {"period_rows": period, "depth": depth})
 
