@@ -158,5 +158,8 @@ def _offset(change: Float32Array, level: Float32Array) -> Float32Array:
             return np.zeros_like(error)
         offset = np.asarray(offset * (noise / (noise + error)), np.float32)
         followed = change @ offset / max(float(offset @ offset), TINY)
-        gain = np.asarray(np.clip(followed, 0, ROW_NOISE.max_gain), np.float32)[:, None]
+        gain = np.maximum(followed, 0)
+        # The offset is that of cells which follow it as they are, in every octave.
+        gain *= gain.sum() / max(float(gain @ gain), TINY)
+        gain = np.asarray(np.minimum(gain, ROW_NOISE.max_gain), np.float32)[:, None]
     return offset

@@ -44,7 +44,7 @@ class RowNoiseSettings:
     middle: float = 0.1
     #: Cells that are worth one whose slots are independent of all others; part of the slots' power that columns share.
     cells_a_column: float = 5.0
-    common: float = 0.2
+    common: float = 0.5
     #: Distance of rows whose noise has nothing in common, and correlation at it from which light is no noise.
     distance: int = 3
     white: float = 0.3

@@ -62,6 +62,13 @@ def test_noise_is_taken_out_along_bent_rows(k1: float) -> None:
     assert bend == pytest.approx(N_ROWS * k1 * x**2 * y, abs=1.0)
 
 
+def test_noise_is_found_as_large_as_it_was_drawn() -> None:
+    """Cells that follow it halfway in one octave and wholly in the next would keep a part of each."""
+    noise = find_row_noise(read_plane(frame_of(picture(0.015))))
+    assert noise is not None
+    assert noise.light.std() == pytest.approx(0.015, rel=0.15)
+
+
 @pytest.mark.parametrize("same_slots", [False, True])
 def test_slots_are_no_noise(same_slots: bool) -> None:
     """Nor are those that all columns share."""
