@@ -36,6 +36,8 @@ class _Sum:
     placement: Placement
     #: Log-likelihood ratio of the zeros after a message, of each photograph by itself.
     zeros: float = 0.0
+    #: Whether it is the sum of one photograph's bursts, which the search for beacons has tried.
+    is_tried: bool = False
 
     @property
     def rank(self) -> float:
@@ -68,8 +70,9 @@ class CutPhotos:
             *sums[:_MAX_SUMS],
             *self._sums,
         ][: 2 * _MAX_SUMS]
+        untried = [s for s in sums[: 2 * _MAX_SUMS] if not s.is_tried]
         for layout in self._layouts:
-            found = next(self._read(layout.length, sums[: 2 * _MAX_SUMS]), None)
+            found = next(self._read(layout.length, untried), None)
             if found is not None:
                 self._sums = [found[1]]
                 return [(found[0], found[1].placement)]
@@ -123,7 +126,8 @@ def _views(soft: FrameSoftBits) -> Iterator[_Sum]:
                 moved = np.roll(llr, start, axis=0)
                 for placement in groups[group]:
                     total = placement.of(moved)
-                    yield _Sum(total, 0.0, _level(total), placement)
+                    is_tried = candidate is soft and not soft.open_start
+                    yield _Sum(total, 0.0, _level(total), placement, is_tried=is_tried)
 
 
 def _level(total: Float32) -> float:

@@ -93,6 +93,19 @@ def test_no_code_is_tried_where_bits_that_a_text_repeats_differ(
     assert tried == []
 
 
+def test_a_whole_packet_without_a_text_is_decoded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tried: list[bytes] = []
+
+    def fails(_: object, llr: np.ndarray, *__: object, **___: object) -> np.ndarray:
+        tried.extend(row.tobytes() for row in llr)
+        return np.zeros(len(llr), bool)
+
+    monkeypatch.setattr(ldpc, "decode", fails)
+    whole = photo(range(SYMBOLS), np.random.default_rng(2)).alternatives[0]
+    assert LinkReceiver(COLUMNS, SYMBOLS).add(replace(whole, open_start=False, source="photo")) == []
+    assert len(tried) == len(set(tried)) > 0
+
+
 #: Slot at the first row, and whether no header is in view: five slots of the packet before are, of the second.
 @pytest.mark.parametrize(("start_slot", "is_open"), [(12.0, True), (112.0, False)])
 def test_a_picture_of_less_than_a_packet_gives_its_text(start_slot: float, is_open: bool) -> None:
