@@ -7,6 +7,7 @@ import pty
 import subprocess
 import sys
 import termios
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from rxcli.errors import ExitCode
 from rxcli.ingest.v4l2 import CameraCounts, LiveSource
 from rxcli.results.aim import Aim
 from rxcli.results.report import wrapped
-from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
+from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult, ReceivedObject
 
 WIDTH, HEIGHT, N_FRAMES = 96, 64, 10
 UNPLUGGED = "vlc-rx: /dev/video0: the camera was unplugged; plug it in again"
@@ -170,6 +171,26 @@ def test_how_the_command_ends(
     assert "ok" not in statuses
     if "damage_every" in faults:
         assert int(lines[-1].rpartition(" ")[2]) > 0
+
+
+def test_packets_are_shown_until_a_file_has_come(
+    bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = (ColumnResult(0, "ok", packets=(PacketResult(0.0, 1.5, 16, "ab12", confidence=1.0, ber_hat=0.0),)),)
+    file = ReceivedObject("a.txt", b"sent", 4, "00", 1, 1, "", 2, 0.0)
+
+    def receive(frames: Iterator[Frame], _options: Any) -> Iterator[FrameResult]:
+        for frame in frames:
+            objects = (file,) if frame.index == 2 else ()
+            yield FrameResult(frame.source, frame.index, frame.time_s, "ok", columns=columns, objects=objects)
+
+    monkeypatch.setattr("rxcli.receiver.receive.receive", receive)
+    bench.plug_in()
+    assert run(["live", "/dev/video0", "--until-complete", "--out", str(tmp_path / "out")]) == ExitCode.OK
+    assert (tmp_path / "out" / "a.txt").read_bytes() == b"sent"
+    captured = capsys.readouterr()
+    assert captured.out.count("ab12") == 3
+    assert "LOCKED | columns 1/1" in captured.err
 
 
 def test_modes_are_listed(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
