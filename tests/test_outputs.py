@@ -184,11 +184,12 @@ def test_a_temporary_file_is_not_where_a_link_may_wait_and_is_never_set_uid(tmp_
     assert victim.read_text() == "mine"
 
 
-@pytest.mark.parametrize("kind", ["file", "pipe", "link"])
+@pytest.mark.parametrize("kind", ["file", "pipe", "link", "link to the same"])
 def test_a_received_file_replaces_what_is_there_and_is_not_written_into_it(kind: str, tmp_path: Path) -> None:
     path, victim = tmp_path / "out" / "a.txt", tmp_path / "victim"
     path.parent.mkdir()
-    victim.write_text("mine")
+    there = "sent" if kind == "link to the same" else "mine"
+    victim.write_text(there)
     make = {"file": lambda: path.write_text("mine"), "pipe": lambda: os.mkfifo(path)}
     make.get(kind, lambda: path.symlink_to(victim))()
     received = ReceivedObject("a.txt", b"sent", 4, "00", 1, 1, "", 0, 0.0)
@@ -198,7 +199,7 @@ def test_a_received_file_replaces_what_is_there_and_is_not_written_into_it(kind:
     assert list(path.parent.iterdir()) == [path]
     assert path.is_file()
     assert not path.is_symlink()
-    assert (path.read_bytes(), victim.read_text()) == (b"sent", "mine")
+    assert (path.read_bytes(), victim.read_text()) == (b"sent", there)
 
 
 def test_a_pipe_with_the_name_of_a_tap_is_refused(tmp_path: Path) -> None:
