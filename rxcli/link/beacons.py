@@ -26,6 +26,8 @@ _MIN_OBSERVED = 0.5
 _ITERATIONS = 40
 #: Log-likelihood ratio below which bursts, or copies within one burst, do not carry the same message.
 _MIN_SIMILARITY = -8.0
+#: The same of bits that a message sends twice within a burst: one symbol may be misread.
+MIN_REPEATED = -30.0
 #: Log-likelihood ratio above which bursts are copies of each other.
 _COPIES = 8.0
 #: Minimum log-likelihood of a decoded word per bit, relative to ln 2: the CRC of a wrong word may fit by chance.
@@ -210,7 +212,7 @@ class BeaconSearch:
             return
         buffers = np.stack([gathered(layout, placement.of(total)) for placement in placements])
         alone = float(candidate.levels.sum())
-        possible = np.flatnonzero([same_bits_llr(buffer, alone) >= _MIN_SIMILARITY for buffer in buffers])
+        possible = np.flatnonzero([same_bits_llr(buffer, alone) >= MIN_REPEATED for buffer in buffers])
         if possible.size == 0:
             return
         buffers = buffers[possible]

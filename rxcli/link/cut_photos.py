@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.link.beacons import gathered, read_words
+from rxcli.link.beacons import MIN_REPEATED, gathered, read_words
 from rxcli.link.formats import unprotect_beacon
 from rxcli.link.known_bits import known_bits
 from rxcli.link.layout import BEACON_LENGTHS, beacon_layout
@@ -96,7 +96,7 @@ class CutPhotos:
         for start in range(0, len(sums), _BATCH):
             gathering = ((gathered(layout, s.total[None]), s) for s in sums[start : start + _BATCH])
             # Bits that are sent twice agree.
-            agreeing = [(b, s) for b, s in gathering if same_bits_llr(b, s.level) >= _MIN_SIMILARITY]
+            agreeing = [(b, s) for b, s in gathering if same_bits_llr(b, s.level) >= MIN_REPEATED]
             if not agreeing:
                 continue
             buffers, part = np.stack([b for b, _ in agreeing]), [s for _, s in agreeing]

@@ -44,6 +44,15 @@ def test_one_photo_that_shows_most_of_a_packet_gives_its_text(first: int, placem
     assert receiver.placement == placement
 
 
+@pytest.mark.parametrize("source", ["", "photo"])
+def test_a_label_that_is_sent_twice_may_be_misread_once(source: str) -> None:
+    sent = message(TEXT).labels(np.arange(1), COLUMNS, SYMBOLS)
+    llr = detect(sent, 5, (12.0,) * COLUMNS, np.random.default_rng(5)).astype(np.float32)
+    llr[:, -1, -1, :3] *= -1  # The first label once more.
+    [got] = LinkReceiver(COLUMNS, SYMBOLS).add(FrameSoftBits(np.arange(1), llr, source=source))
+    assert got.text == TEXT  # type: ignore[union-attr]
+
+
 def test_photos_of_different_parts_add_up() -> None:
     receiver, rng = LinkReceiver(COLUMNS, SYMBOLS), np.random.default_rng(3)
     came = [receiver.add(photo(range(k, k + 3), rng, number=k)) for k in (1, 5)]
