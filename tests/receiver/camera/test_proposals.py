@@ -118,6 +118,21 @@ def test_an_exposure_that_no_file_states_is_proposed_by_the_width_of_the_stripes
     assert best.exposure_slots == pytest.approx(exposure_slots, abs=0.4)
 
 
+@pytest.mark.parametrize(("corrected", "k1"), [(False, 0.0), (True, 0.09)])
+def test_less_than_a_packet_gives_slots_and_leaves_length_and_direction_open(corrected: bool, k1: float) -> None:
+    """Eighty of 130 slots are in view; stripes may be bent, which the file does not say."""
+    frame, corners, _ = phone("data-17k3", 8.0, 720, corrected=corrected, k1=k1, exposure_slots=0.7)
+    proposed = blind.propose_slots(strips_of(frame, corners))
+    assert {one.packet_slots for one in proposed} == {0}
+    best = [one for one in proposed if one.number == 0]
+    assert {one.reversed for one in best} == {False, True}
+    assert best[0].rows_per_slot == pytest.approx(8.0, rel=1e-2)
+    assert best[0].exposure_slots == pytest.approx(0.7, abs=0.4)
+    assert bool(best[0].curvature.any()) == corrected
+    straight = blind.propose_slots(strips_of(frame, corners), may_bend=False)
+    assert not any(one.curvature.any() for one in straight)
+
+
 @pytest.mark.parametrize("exposure_slots", [3.5, 4.0, 6.2])
 def test_an_exposure_of_several_slots_shows_in_the_changes_of_the_light(exposure_slots: float) -> None:
     frame, corners, _ = phone("paper-8k65", 8.0, 1600, exposure_slots=exposure_slots)
@@ -225,7 +240,9 @@ def test_pictures_that_cannot_work_are_named(kind: str, words: str) -> None:
 def test_pictures_without_stripes_propose_nothing() -> None:
     assert not (blind.propose(_flat_strips(np.zeros((40, 400))), SCREENS))
     rng = np.random.default_rng(4)
-    assert not (blind.propose(_flat_strips(rng.normal(0.3, 0.002, (40, 400))), SCREENS))
+    noise = _flat_strips(rng.normal(0.3, 0.002, (40, 400)))
+    assert not blind.propose(noise, SCREENS)
+    assert not blind.propose_slots(noise)
 
 
 def test_rows_against_the_readout_are_turned_and_back() -> None:
