@@ -124,11 +124,10 @@ def test_less_than_a_packet_gives_slots_and_leaves_length_and_direction_open(cor
     frame, corners, _ = phone("data-17k3", 8.0, 720, corrected=corrected, k1=k1, exposure_slots=0.7)
     proposed = blind.propose_slots(strips_of(frame, corners))
     assert {one.packet_slots for one in proposed} == {0}
-    best = [one for one in proposed if one.number == 0]
-    assert {one.reversed for one in best} == {False, True}
-    assert best[0].rows_per_slot == pytest.approx(8.0, rel=1e-2)
-    assert best[0].exposure_slots == pytest.approx(0.7, abs=0.4)
-    assert bool(best[0].curvature.any()) == corrected
+    assert {(one.number, one.reversed) for one in proposed} >= {(0, False), (0, True)}
+    right = [one for one in proposed if one.curvature.any() == corrected]
+    assert min(abs(one.rows_per_slot / 8 - 1) for one in right) < 6e-3
+    assert right[0].exposure_slots == pytest.approx(0.7, abs=0.4)
     straight = blind.propose_slots(strips_of(frame, corners), may_bend=False)
     assert not any(one.curvature.any() for one in straight)
 
