@@ -4,8 +4,6 @@
 pages of other origins are refused.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hmac
@@ -23,7 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import NamedTemporaryFile, TemporaryFile
-from typing import Any
+from typing import Any, Self
 
 from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
@@ -167,7 +165,7 @@ class Server:
         #: The port, once the server runs.
         self.port = site.port
 
-    async def __aenter__(self) -> Server:
+    async def __aenter__(self) -> Self:
         try:
             await self._start()
         except BaseException:

@@ -1,14 +1,12 @@
 """Scenes: everything that one capture depends on, presets, and random ones."""
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import sqrt
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_type_hints
+from typing import Any, Literal, Self, TypeVar, get_type_hints
 
 import msgspec
 import numpy as np
@@ -130,22 +128,22 @@ class Scene:
         """Sensor rows read during one slot."""
         return 1 / (self.sensor.line_delay_s * self.screen.slot_rate_hz)
 
-    def exposed(self, exposure_s: float, factor: float = 1.0) -> Scene:
+    def exposed(self, exposure_s: float, factor: float = 1.0) -> Self:
         """The scene at another exposure, with as many electrons as before times `factor`."""
         light_e_per_s = self.light_e_per_s * (self.exposure_s / exposure_s) * factor
         return replace(self, exposure_s=exposure_s, light_e_per_s=light_e_per_s)
 
-    def metered(self, exposure_s: float) -> Scene:
+    def metered(self, exposure_s: float) -> Self:
         """The scene at another exposure, the gain set by it: white stays white, and electrons grow with the time."""
         ratio = exposure_s / self.exposure_s
         sensor = replace(self.sensor, full_scale_e=self.sensor.full_scale_e * ratio)
         return replace(self, exposure_s=exposure_s, sensor=sensor, iso=max(round(self.iso / ratio), 25))
 
-    def read_in(self, readout_s: float) -> Scene:
+    def read_in(self, readout_s: float) -> Self:
         """The scene before a sensor that reads all its rows in another time."""
         return replace(self, sensor=replace(self.sensor, line_delay_s=readout_s / self.sensor.height))
 
-    def scaled(self, x: float, y: float | None = None, *, keep_readout: bool = False) -> Scene:
+    def scaled(self, x: float, y: float | None = None, *, keep_readout: bool = False) -> Self:
         """The same view on a smaller sensor, for quick sweeps.
 
         Args:
