@@ -26,9 +26,8 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from ingest_files import BAYER, write_dng, write_palette_clip, write_sizes
@@ -127,15 +126,11 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
     return data
 
 
-@dataclass(frozen=True, slots=True)
-class _Kind:
-    """One sort of picture, which is written in every format."""
+class _Kind(NamedTuple):
+    """A picture, RGB, that is written in every format; how often it is taken, and options that go with it."""
 
-    #: (height, width, 3) uint8, RGB.
     picture: NDArray[np.uint8]
-    #: How often it is taken, of all.
     weight: int
-    #: Options that go with it.
     options: tuple[str, ...] = ()
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import pytest
+
 from rxcli.lab.benchmark.cases import problems_in
 from rxcli.receiver import channel, plane
 from rxcli.receiver.decode import detect
@@ -22,17 +24,12 @@ STAGES = (geometry, plane, sync, channel, detect)
 def watched() -> Iterator[list[str]]:
     """While this lasts, problems of the stages' outputs and all warnings are gathered in the list it gives."""
     found: list[str] = []
-    originals = [(module, name, function) for module in STAGES for name, function in _public(module)]
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as caught, pytest.MonkeyPatch.context() as patch:
         warnings.simplefilter("always")
-        for module, name, function in originals:
-            setattr(module, name, _watch(function, f"{module.__name__.rpartition('.')[2]}.{name}", found))
-        try:
-            yield found
-        finally:
-            for module, name, function in originals:
-                setattr(module, name, function)
-            found += [f"{w.category.__name__}: {w.message} ({Path(w.filename).name}:{w.lineno})" for w in caught]
+        for module, name, function in [(stage, *of) for stage in STAGES for of in _public(stage)]:
+            patch.setattr(module, name, _watch(function, f"{module.__name__.rpartition('.')[2]}.{name}", found))
+        yield found
+    found += [f"{w.category.__name__}: {w.message} ({Path(w.filename).name}:{w.lineno})" for w in caught]
 
 
 def _public(module: ModuleType) -> list[tuple[str, Callable[..., Any]]]:
