@@ -123,31 +123,40 @@ def _clocks(context: FrameContext) -> Iterator[_Candidate]:
     if n_visible < SETTINGS.cut_symbols * SLOTS_PER_SYMBOL or exposure_slots > LONG_EXPOSURE_SLOTS:
         return
 
-    def candidate(clock: Clock) -> _Candidate:
+    def candidate(clock: Clock, of_middle: Reception) -> _Candidate:
         acquisition = Acquisition(screen, profiles, clock, (screen,))
-        half = acquisition.of_columns(acquisition.middle_columns)
-        return _Candidate(context, acquisition, evidence.log_evidence(initial_pass(half)))
+        return _Candidate(context, acquisition, evidence.log_evidence(of_middle))
+
+    def middle_pass(clock: Clock) -> Reception:
+        acquisition = Acquisition(screen, profiles, clock, (screen,))
+        return initial_pass(acquisition.of_columns(acquisition.middle_columns))
 
     binned = sync.binned_strips(profiles)
     clock = sync.find_clock(binned, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(binned))
     if clock is not None and clock.header_peak_ratio > SETTINGS.min_lead:
-        yield candidate(clock)
+        yield candidate(clock, middle_pass(clock))
     payload_slots = screen.packet_slots - PREAMBLE_SLOTS
     for part in range(SETTINGS.cut_phases if n_visible < payload_slots else 0):
         row0 = top - part / SETTINGS.cut_phases * rows_per_slot
+        n_shown = int(np.ceil((bottom - row0) / rows_per_slot))
+        clock = Clock(
+            rows_per_slot=rows_per_slot,
+            exposure_slots=exposure_slots,
+            packet_slots=screen.packet_slots,
+            row0=row0,
+            n_slots=min(n_shown, payload_slots - SLOTS_PER_SYMBOL + 1),
+            first_slot=PREAMBLE_SLOTS,
+            burst=np.zeros(1, np.int64),
+            delay_slots=np.zeros(screen.columns),
+            header_peak_ratio=0.0,
+        )
+        # The light of slots is the same wherever symbols begin.
+        initial = middle_pass(clock)
         for phase in range(SLOTS_PER_SYMBOL):
-            clock = Clock(
-                rows_per_slot=rows_per_slot,
-                exposure_slots=exposure_slots,
-                packet_slots=screen.packet_slots,
-                row0=row0,
-                n_slots=min(int(np.ceil((bottom - row0) / rows_per_slot)), payload_slots - phase),
-                first_slot=PREAMBLE_SLOTS + phase,
-                burst=np.zeros(1, np.int64),
-                delay_slots=np.zeros(screen.columns),
-                header_peak_ratio=0.0,
-            )
-            yield candidate(clock)
+            first_slot = PREAMBLE_SLOTS + phase
+            n_slots = min(n_shown, payload_slots - phase)
+            shifted = detected_on(initial, replace(initial.clock, first_slot=first_slot))
+            yield candidate(replace(clock, n_slots=n_slots, first_slot=first_slot), shifted)
 
 
 def _soft_bits(candidate: _Candidate) -> FrameSoftBits:
