@@ -179,7 +179,7 @@ def first_column_features(light: LightProfile, n_columns: int) -> tuple[IntArray
     # Parts next to a border count for neither side.
     off = np.minimum(light.place - starts[:, None], ends[:, None] - light.place)
     inside = (light.in_picture & (off > 1 / _PARTS)) / _PARTS
-    hidden = np.maximum(np.stack([left - starts, ends - right]), 0.0)
+    hidden = np.clip(np.stack([left - starts, ends - right]), 0, 1)
     rises, falls = light.edges(light.level)
     begins, ceases = light.edges(light.coherent)
     brightens, fades = light.edges(light.faint, light.is_faint)
@@ -191,13 +191,15 @@ def first_column_features(light: LightProfile, n_columns: int) -> tuple[IntArray
         inside @ (1 - light.coherent),
         inside @ light.steady / n_columns,
         *(off_middle * (not reaches.any())),
-        ~reaches @ hidden > _IN_VIEW,
+        ~reaches @ hidden,
         _at(begins, border) + _at(ceases, border + width),
         _at(rises, border) + _at(falls, border + width),
         _at(brightens, border) + _at(fades, border + width),
         _paired(rises, falls, border + width // 2, width),
     )
-    return starts, np.stack(terms, axis=1).astype(np.float64), bool(reaches.all())
+    # Light across more columns than the screen has is not all the columns'.
+    fills = bool(reaches.all()) and right - left < n_columns
+    return starts, np.stack(terms, axis=1).astype(np.float64), fills
 
 
 def _paired(rises: FloatArray, falls: FloatArray, middle: IntArray, width: int) -> FloatArray:

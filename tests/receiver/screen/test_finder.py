@@ -22,6 +22,7 @@ from rxcli.receiver.screen.find import (
 )
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
 from rxcli.receiver.screen.numbering import (
+    WEIGHTS,
     LightProfile,
     _faint_light,
     first_column_features,
@@ -421,6 +422,16 @@ def test_light_that_ends_just_before_the_edge_of_the_picture_ends_on_the_screen(
     columns, log_odds, fills = first_columns(profile(7, 20, right=20.4), 20)
     assert columns[log_odds.argmax()] == 0
     assert not fills
+
+
+def test_light_across_more_columns_than_a_screen_has_does_not_fill_the_picture_with_it() -> None:
+    assert [first_columns(profile(-2, right, right=right), 20)[2] for right in (17.5, 22.0)] == [True, False]
+
+
+def test_a_side_counts_as_hidden_by_the_share_of_a_column_outside_the_picture() -> None:
+    columns, features, _ = first_column_features(profile(7, 13, right=19.625), 20)
+    hidden = dict(zip(columns.tolist(), features[:, WEIGHTS.index("hidden_unlit")].tolist(), strict=True))
+    assert [round(hidden[first], 2) for first in (-3, -2, -1, 0, 1)] == [1, 0.06, 0, 0.44, 1]
 
 
 def test_the_shipped_weights_are_those_of_the_features() -> None:
