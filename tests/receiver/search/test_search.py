@@ -27,6 +27,7 @@ from rxcli.receiver.search import Found, outlines, search
 from rxcli.receiver.search.evidence import distinct_share
 from rxcli.receiver.search.numbers import less_likely_outlines
 from rxcli.receiver.search.propose import Proposer
+from rxcli.receiver.search.search import _Walk
 from rxcli.types import Frame, FrameResult
 
 SHIPPED = usual_screens()
@@ -147,6 +148,25 @@ def test_columns_with_packets_are_not_left_out_of_the_screen() -> None:
     kept, *less_likely = less_likely_outlines(found.best, (own, *rivals), proposer)
     assert kept is own
     assert max(one.log_odds for one in less_likely) < -3.0
+
+
+@pytest.mark.parametrize(("exposure_slots", "measured"), [(4.0, ["middle"]), (1.0, ["all"])])
+def test_a_long_exposure_is_measured_on_its_middle_columns_first(
+    exposure_slots: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock, own = SimpleNamespace(exposure_slots=exposure_slots), list[str]()
+    middle = SimpleNamespace(part="middle")
+    acquisition = SimpleNamespace(clock=clock, part="all", middle_columns=None, of_columns=lambda _: middle)
+
+    def measure(_: object, __: object, acquisition: Any) -> Any:
+        own.append(acquisition.part)
+        return SimpleNamespace(score=0.0, evidence=1.0)
+
+    monkeypatch.setitem(_Walk.run.__globals__, "_acquired", lambda _: acquisition)
+    monkeypatch.setattr(_Walk, "_measured", measure)
+    estimated: Any = SimpleNamespace(camera=SimpleNamespace(hypothesis=1), screen=SimpleNamespace(columns=20))
+    _Walk(Proposer(FrameCache(Frame(np.zeros((8, 8), np.uint8), "")), ReceiverOptions(), ()), 8)._score(estimated)
+    assert own == measured
 
 
 def test_every_hypothesis_is_recorded_with_its_fate(tmp_path: Path) -> None:
