@@ -16,7 +16,7 @@ from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import ColumnStrips, joined
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, SlotLight, column_light
-from rxcli.types import Clock, Float32Array, FloatArray
+from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
 #: Rows over which the bend is straight: of a block of the normal equations.
 _BLOCK_ROWS = 16
@@ -55,13 +55,17 @@ def settle(
     start = np.concatenate([[clock.row0, clock.rows_per_slot], _turned(hypothesis.curvature, hypothesis)])
     least = hypothesis.stated_exposure_slots
     exposure, exposure_sd = max(clock.exposure_slots, least), 0.0
-    # A longer one is known better by the changes of the light.
-    if exposure <= LONG_EXPOSURE_SLOTS:
+    straight, bent = np.array([0, 1]), np.arange(2, start.size)
+    # A longer one is known better by the changes of the light, and its rows per slot by the line of these.
+    is_long = exposure > LONG_EXPOSURE_SLOTS
+    if is_long:
+        straight = straight[:1]
+    else:
         exposure, exposure_sd = model.exposure(start, exposure)
         exposure = max(exposure, least)
-    values, covariance, near = model.fit(start, exposure, start.size if may_bend else 2)
+    values, covariance, near = model.fit(start, exposure, np.append(straight, bent) if may_bend else straight)
     if may_bend and _chi_square(values[2:], covariance[2:, 2:]) < SETTINGS.bent_chi_square:
-        values, covariance, near = model.fit(values * (np.arange(values.size) < 2), exposure, 2)
+        values, covariance, near = model.fit(values * (np.arange(values.size) < 2), exposure, straight)
     if near.explained < SETTINGS.min_explained:
         return hypothesis, 0.0
     moved = float((np.abs(model.times(values) - model.times(start)) * model.strips.inside).max())
@@ -69,7 +73,7 @@ def settle(
     found = replace(
         hypothesis,
         rows_per_slot=float(values[1]),
-        rows_per_slot_sd=float(sd[1]),
+        rows_per_slot_sd=hypothesis.rows_per_slot_sd if is_long else float(sd[1]),
         curvature=_turned(values[2:], hypothesis),
         curvature_sd=sd[2:],
         exposure_slots=exposure,
@@ -140,13 +144,13 @@ class _Model:
         n_slots = self.strips.n_columns * float(np.ptp(self.strips.rows)) / values[1]
         return float(np.clip(-slope / (2 * curve), tried[0], tried[-1])), float(np.sqrt(1 / (curve * n_slots)))
 
-    def fit(self, values: FloatArray, exposure_slots: float, n_free: int) -> tuple[FloatArray, FloatArray, _Near]:
-        """Gauss-Newton on the first `n_free` values: the row-time map, its covariance, the fit."""
+    def fit(self, values: FloatArray, exposure_slots: float, free: IntArray) -> tuple[FloatArray, FloatArray, _Near]:
+        """Gauss-Newton on the values of the numbers `free`: the row-time map, its covariance, the fit."""
         times = self.times(values)
         for _ in range(SETTINGS.settle_steps):
             wave, slope = self._slots.mean_and_slope(times, exposure_slots)
             near = self._near(wave)
-            step, covariance = self._step(values, times, near, slope, n_free)
+            step, covariance = self._step(values, times, near, slope, free)
             values = values + step
             before, times = times, self.times(values)
             if float(np.abs(times - before)[:, ::_BLOCK_ROWS].max()) < SETTINGS.converged_slots:
@@ -169,7 +173,7 @@ class _Model:
         return _Near(wave, gain, residual, weight, power / max(power + left, TINY))
 
     def _step(
-        self, values: FloatArray, times: Float32Array, near: _Near, slope: Float32Array, n_free: int
+        self, values: FloatArray, times: Float32Array, near: _Near, slope: Float32Array, free: IntArray
     ) -> tuple[FloatArray, FloatArray]:
         """Step (6,) of the row-time map and its covariance, by what the columns differ in."""
         power = near.gain * slope
@@ -178,18 +182,18 @@ class _Model:
         pull = np.add.reduceat(near.weight * power * near.residual, blocks, axis=1).astype(np.float64)
         middle = np.minimum(blocks + _BLOCK_ROWS // 2, times.shape[1] - 1)
         bend = (self._terms[:, :, :-1] + self._terms[:, :, 1:]) / 2
-        jacobian = np.concatenate([np.full((1, *pull.shape), -1.0), -times[None, :, middle], bend])[:n_free] / values[1]
-        flat = jacobian.reshape(n_free, -1)
+        jacobian = np.concatenate([np.full((1, *pull.shape), -1.0), -times[None, :, middle], bend])[free] / values[1]
+        flat = jacobian.reshape(free.size, -1)
         prior = np.zeros((values.size, values.size))
         prior[2:, 2:] = SETTINGS.samples_per_independent * _PRECISION
-        prior = prior[:n_free, :n_free]
-        inverse = np.linalg.inv((flat * information.ravel()) @ flat.T + prior + TINY * np.eye(n_free))
+        prior = prior[np.ix_(free, free)]
+        inverse = np.linalg.inv((flat * information.ravel()) @ flat.T + prior + TINY * np.eye(free.size))
         step = np.zeros_like(values)
-        step[:n_free] = inverse @ (flat @ pull.ravel() - prior @ values[:n_free])
+        step[free] = inverse @ (flat @ pull.ravel() - prior @ values[free])
         n_columns = self.strips.n_columns
-        spread = (jacobian * pull).reshape(n_free, n_columns, -1).sum(axis=2)
+        spread = (jacobian * pull).reshape(free.size, n_columns, -1).sum(axis=2)
         spread -= spread.mean(axis=1, keepdims=True)
         scale = SETTINGS.sd_scale**2 * n_columns / max(n_columns - 1, 1)
         covariance = np.zeros((values.size, values.size))
-        covariance[:n_free, :n_free] = scale * inverse @ (spread @ spread.T) @ inverse
+        covariance[np.ix_(free, free)] = scale * inverse @ (spread @ spread.T) @ inverse
         return step, covariance

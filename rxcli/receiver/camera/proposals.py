@@ -282,8 +282,12 @@ def _both_ways(
             curvature=bend,
             exposure_slots=clock.stated or clock.found,
             score=max(header, 0.0) ** 2 + common,
-            # A period that is off by a quarter of a slot over the picture shows as well.
-            rows_per_slot_sd=rows * rows * pitch / (4 * copies.size),
+            # A period that is off by a part of a slot over the picture shows as well.
+            rows_per_slot_sd=rows
+            * rows
+            * pitch
+            * SETTINGS.period_error[clock.found > LONG_EXPOSURE_SLOTS]
+            / copies.size,
             curvature_sd=np.abs(bend) / 4,
             stated_exposure_slots=clock.stated,
         )

@@ -47,6 +47,8 @@ class EstimateSettings:
     same_clock: float = 4e-3
     n_proposed: int = 5
 
+    #: Error of a period over the picture, slots: by the copies of packets, and by the line of a long exposure.
+    period_error: tuple[float, float] = (0.25, 0.0625)
     #: Step between the exposures that are compared, slots.
     exposure_step: float = 0.1
     #: Least strength of a line that is looked at, as a share of the strongest.

@@ -3,7 +3,8 @@
 The strips of a whole clip lie where its first frame has the screen, and the outline of a single frame may be wrong by
 many pixels. The texture of the picture gives the motion of the screen from the first frame to the next ones. The
 outlines found in these are carried back, and their median is used. Where the first frame shows plain packets, the next
-ones are not searched: the outline is followed.
+ones are not searched: the outline is followed. Where it shows none, or those of a long exposure, it is searched without
+its texture as well, which is what it has in common with the frames after it.
 """
 
 from __future__ import annotations
@@ -13,15 +14,106 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.receiver.clip.camera import ClipCamera, Located
-from rxcli.receiver.clip.common_clock import shows_little
+from rxcli.receiver.clip.common_clock import Start, shows_little, start_by
 from rxcli.receiver.clip.scene import followed_outline
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.plane import shift_of_texture, shows_same, without_texture
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.registration import ScreenTexture
-from rxcli.receiver.search import screen_in_changes
+from rxcli.receiver.search import Found
+from rxcli.receiver.search.cameras import DEFAULT_TONE
 from rxcli.types import FloatArray, Frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HiddenFrames:
+    """The first frames, as long as the texture of the picture may hide the slots in them."""
+
+    frames: tuple[Frame, ...]
+    #: What the first of them shows by itself.
+    alone: Located | Failure
+    #: Whether more frames are worth waiting for.
+    may_wait: bool = True
+
+    @classmethod
+    def begin(cls, frame: Frame, camera: ClipCamera, *, may_wait: bool) -> HiddenFrames:
+        """Search the first frame."""
+        return cls((frame,), camera.locate(FrameCache(frame)), may_wait)
+
+    @property
+    def are_enough(self) -> bool:
+        """Whether no further frame is needed."""
+        if not self.may_wait or len(self.frames) >= SETTINGS.n_for_texture:
+            return True
+        alone = self.alone
+        if not isinstance(alone, Located):
+            return False
+        return not alone.is_open or (alone.context.camera.hypothesis is None and shows_little(alone.context))
+
+    def with_frame(self, frame: Frame, camera: ClipCamera) -> HiddenFrames:
+        """These frames and one more."""
+        return replace(self, frames=(*self.frames, frame))
+
+    def shown(self, camera: ClipCamera) -> FirstFrames | Failure:
+        """The frames with what the first of them shows, by itself or without what all of them have in common."""
+        alone, found = self.alone, self._without_texture(camera) if len(self.frames) > 1 else None
+        if found is not None and (isinstance(alone, Failure) or alone.is_bent or found.evidence > alone.evidence):
+            return found
+        if isinstance(alone, Failure):
+            return alone
+        frames = FirstFrames.begin(self.frames[0], camera, alone)
+        for frame in self.frames[1:]:
+            further = replace(frames, frames=(*frames.frames, frame))
+            frames = further if frames.are_enough else frames.with_frame(frame, camera)
+        return frames
+
+    def _without_texture(self, camera: ClipCamera) -> FirstFrames | None:
+        """What the first frame shows without its texture: the surest camera of some frames, and their median outline.
+
+        None where it shows no packets.
+        """
+        n = len(self.frames)
+        flat = {number: FrameCache(self._flat(number)) for number in (0, n // 2, n - 1)}
+        if not shows_same(self.frames[0], flat[0].frame, DEFAULT_TONE):
+            return None
+        located = {number: camera.locate(cache, may_bend=False) for number, cache in flat.items()}
+        shown = {n: each for n, each in located.items() if isinstance(each, Located) and self._may_be(each)}
+        if not shown:
+            return None
+        surest = max(shown, key=lambda number: shown[number].evidence)
+        outline = self._agreed({number: each.outline for number, each in shown.items()}, surest, camera)
+        best = shown[surest]
+        assert isinstance(best.found, Found)
+        alone = replace(camera, context=best.context).locate(flat[0], [outline], may_bend=False)
+        if isinstance(alone, Located) and self._may_be(alone):
+            return FirstFrames(self.frames, alone, evidence=alone.evidence)
+        there = replace(best.context, cache=flat[0], sampled_corners=outline.corners)
+        located_there = Located(outline, there, None, best.framing)
+        return FirstFrames(self.frames, located_there, start=start_by(best.found, self.frames), evidence=best.evidence)
+
+    def _agreed(self, outlines: dict[int, Outline], surest: int, camera: ClipCamera) -> Outline:
+        """The median of outlines of some frames, where it is in the first; of two the surest."""
+        outline = outlines[surest]
+        if camera.options.corners is not None:  # They hold for every frame.
+            return replace(outline, strips=None, grid=None)
+        corners = {number: each.corners - self._motion(number) for number, each in outlines.items()}
+        agreed = np.median(list(corners.values()), axis=0) if len(corners) > 2 else corners[surest]
+        return replace(outline, corners=agreed, strips=None, grid=None)
+
+    def _may_be(self, located: Located) -> bool:
+        """Whether packets were found that the texture may have hidden."""
+        return located.shows_packets and (located.is_long or isinstance(self.alone, Failure))
+
+    def _flat(self, number: int) -> Frame:
+        """A frame without its texture."""
+        rest = [*self.frames[:number], *self.frames[number + 1 :]]
+        return without_texture(self.frames[number], rest, DEFAULT_TONE)
+
+    def _motion(self, number: int) -> FloatArray:
+        """(2,) pixels by which the screen moves from the first frame to another one."""
+        return shift_of_texture(self.frames[0], self.frames[number], DEFAULT_TONE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,30 +124,17 @@ class FirstFrames:
     #: Where the screen is in the first of them, with the surest of their cameras.
     located: Located
     #: Of the screen; None where there is nothing to compare an outline with, or the user gave the corners.
-    texture: ScreenTexture | None
+    texture: ScreenTexture | None = None
     #: Corners (4, 2) that were found in each frame, carried back to the first, less those found there.
-    differences: tuple[FloatArray, ...]
-    #: Whether the screen was found in what changed from the first to the second.
-    is_in_changes: bool = False
+    differences: tuple[FloatArray, ...] = ()
+    #: The clock that another of them shows, where the first does not.
+    start: Start | None = None
+    #: Of the packets in the surest of them.
+    evidence: float = 0.0
 
     @classmethod
-    def begin(cls, frame: Frame, camera: ClipCamera) -> FirstFrames | Failure:
-        """Search the first frame."""
-        located = camera.locate(FrameCache(frame))
-        return located if isinstance(located, Failure) else cls._at(frame, camera, located)
-
-    @classmethod
-    def in_changes(cls, frame: Frame, following: Frame, camera: ClipCamera) -> FirstFrames | None:
-        """Search the first frame by what changed from it to the next; None where that shows no screen."""
-        cache = FrameCache(frame)
-        outlines = screen_in_changes(cache, following, camera.options)
-        located = camera.locate(cache, outlines) if outlines else None
-        if not isinstance(located, Located):
-            return None
-        return replace(cls._at(frame, camera, located), is_in_changes=True)
-
-    @classmethod
-    def _at(cls, frame: Frame, camera: ClipCamera, located: Located) -> FirstFrames:
+    def begin(cls, frame: Frame, camera: ClipCamera, located: Located) -> FirstFrames:
+        """The first frame, and where the screen is in it."""
         corners = located.context.sampled_corners
         texture = None if camera.options.corners is not None else ScreenTexture(frame, corners, None)
         return cls((frame,), located, texture, (np.zeros_like(corners),))
@@ -81,26 +160,19 @@ class FirstFrames:
 
     def agreed(self) -> Located:
         """The first frame with the outline on which all of them agree."""
+        if not self.differences:
+            return self.located
         return self.located.moved_to(self.located.context.sampled_corners + np.median(self.differences, axis=0))
 
     def with_frame(self, frame: Frame, camera: ClipCamera) -> FirstFrames:
         """These frames and one more; it is searched for its outline and its camera as far as they are unsure."""
-        is_first = len(self.frames) == 1
-        if is_first and self.texture is not None and not (self.is_in_changes or self.located.is_plain):
-            by_changes = FirstFrames.in_changes(self.frames[0], frame, camera)
-            if by_changes is not None and (self.located.is_open or by_changes.located.evidence > self.located.evidence):
-                return by_changes.with_frame(frame, camera)
-        outlines = [self.located.outline] if self.is_in_changes else None
         longer, located, found = replace(self, frames=(*self.frames, frame)), self.located, None
         unsure = located.camera_error == np.inf or (located.camera_error > 0 and self.shows_little)
         if unsure or not (self._agree or located.is_plain):
-            found = (camera if unsure else replace(camera, context=located.context)).locate(FrameCache(frame), outlines)
+            found = (camera if unsure else replace(camera, context=located.context)).locate(FrameCache(frame))
             longer = replace(longer, located=located.with_surer_camera(found) if unsure else located)
-        if self._agree or (self.is_in_changes and is_first):
+        if self._agree:
             return longer
-        if self.is_in_changes:
-            changes = screen_in_changes(FrameCache(self.frames[-1]), frame, camera.options)
-            return longer._compared(self.frames[-1], changes[0] if changes else None)
         return longer._compared(frame, None if found is None else found.outline, is_followed=found is None)
 
     def _compared(self, frame: Frame, outline: Outline | None, *, is_followed: bool = False) -> FirstFrames:

@@ -53,6 +53,17 @@ class Located:
         return self.found.best.evidence if isinstance(self.found, Found) else 0.0
 
     @property
+    def shows_packets(self) -> bool:
+        """Whether there are packets beyond doubt."""
+        return self.evidence >= search_settings.few_packets
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether stripes seem to be bent, so that the screen cannot be tracked."""
+        hypothesis = self.context.camera.hypothesis
+        return hypothesis is not None and bool(hypothesis.curvature.any())
+
+    @property
     def is_long(self) -> bool:
         """Whether packets of a long exposure were found."""
         return isinstance(self.found, Found) and self.found.best.reception.is_long
@@ -112,12 +123,14 @@ class ClipCamera:
         """What is known of the camera of another frame: nothing where it is of another kind."""
         return self if self.fits(frame) and "tracking" in self.options.skip else replace(self, context=None)
 
-    def locate(self, cache: FrameCache, outlines: list[Outline] | None = None) -> Located | Failure:
+    def locate(
+        self, cache: FrameCache, outlines: list[Outline] | None = None, *, may_bend: bool = True
+    ) -> Located | Failure:
         """Find the screen in a frame, and the camera where it is not known; a failure where there is none.
 
-        `outlines` are of the screen; None: it is looked for.
+        `outlines` are of the screen; None: it is looked for. See `search` for `may_bend`.
         """
-        found = search(cache, self.options, self.context, outlines=outlines)
+        found = search(cache, self.options, self.context, outlines=outlines, may_bend=may_bend)
         context = found.best.context if isinstance(found, Found) else found.context or self.context
         if found.outline is None or context is None:
             assert isinstance(found, Failure)
@@ -162,7 +175,7 @@ class ClipCamera:
         corners = located.context.sampled_corners
         context = replace(self.context or located.context, cache=cache, sampled_corners=corners)
         camera = replace(self, context=context)
-        predicted = None if start is None else acquisition_at(start, context)
+        predicted = None if start is None else acquisition_at(start, replace(context, cache=located.context.cache))
         if predicted is not None:
             return camera, Acquired(context, predicted, initial_pass(predicted), self.options.screens)
         # Of the camera's lens, and in no need of refinement.

@@ -17,6 +17,7 @@ from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.acquisition import Acquisition, distinct_screens, noise_of, variants_of
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
+from rxcli.receiver.search import Found
 from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.receiver.sync.tracking import LinkTime
@@ -67,6 +68,22 @@ def common_clock(
     return replace(start, certainty=float(certainty)), at
 
 
+def start_by(found: Found, frames: Sequence[Frame]) -> Start:
+    """The clock of the first of some frames by that which is found in any of them."""
+    best = found.best
+    screen, clock, frame = best.acquisition.screen, best.reception.clock, best.context.frame
+    period = _period_s(frames) * screen.slot_rate_hz
+    slot = clock.first_slot - clock.row0 / clock.rows_per_slot
+    time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
+    time.begin(frames[0].index, frames[0].time_s, slot - (frame.index - frames[0].index) * period, period)
+    return Start(screen, best.acquisition.variants, time, clock.header_peak_ratio, best.evidence)
+
+
+def _period_s(frames: Sequence[Frame]) -> float:
+    times_s, numbers = np.array([(frame.time_s, frame.index) for frame in frames]).T
+    return float(np.polyfit(numbers - numbers[0], times_s, 1)[0])
+
+
 def _possible_contexts(
     frames: Sequence[Frame], context: FrameContext, screens: Sequence[ScreenProfile]
 ) -> Iterator[FrameContext]:
@@ -93,8 +110,7 @@ def _possible_contexts(
 def _starts(frames: Sequence[Frame], context: FrameContext) -> Iterator[Start]:
     """The clock of each screen that all frames together show; `context` is of the first of them."""
     line_delay_s = context.camera.line_delay_s
-    times_s, numbers = np.array([(frame.time_s, frame.index) for frame in frames]).T
-    period_s = float(np.polyfit(numbers - numbers[0], times_s, 1)[0])
+    period_s, numbers = _period_s(frames), np.array([frame.index for frame in frames])
     starts = (numbers - numbers[0]) * period_s / line_delay_s
     for screen in distinct_screens(context.screens):
         each = (replace(context, cache=FrameCache(frame, context.timer)) for frame in frames)

@@ -15,7 +15,7 @@ import numpy as np
 
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.clip.acquiring import FirstFrames
+from rxcli.receiver.clip.acquiring import FirstFrames, HiddenFrames
 from rxcli.receiver.clip.camera import Acquired, ClipCamera, Located
 from rxcli.receiver.clip.common_clock import common_clock
 from rxcli.receiver.clip.ledger import Ledger
@@ -30,7 +30,6 @@ from rxcli.receiver.light import slot_llr
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.refusal import STEADY_LIGHT
-from rxcli.receiver.search.settings import SETTINGS as search_settings
 from rxcli.receiver.still import apply_autoencoder, decode
 from rxcli.receiver.sync import tracking
 from rxcli.types import FloatArray, Frame, FrameResult, OnTaps
@@ -76,9 +75,9 @@ class Acquiring:
     """No frame has been received: the first ones wait until they agree."""
 
     known: Known
-    frames: FirstFrames | None = None
-    #: A frame that shows no screen by itself, and why.
-    alone: tuple[Frame, Failure] | None = None
+    frames: HiddenFrames | FirstFrames | None = None
+    #: Whether frames that show nothing by themselves may wait for others.
+    may_wait: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,13 +112,8 @@ def step(state: State, frame: Frame) -> tuple[State, list[FrameResult]]:
 
 def finish(state: State) -> list[FrameResult]:
     """The results still held back."""
-    if isinstance(state, Acquiring) and state.alone is not None:
-        after, results = _receive(Lost(state.known), *state.alone)
-        return results + after.known.ledger.finish()
-    if not isinstance(state, Acquiring) or state.frames is None:
-        return state.known.ledger.finish()
-    after, results = _receive_first(state.known, state.frames)
-    return results + after.known.ledger.finish()
+    state, results = _received(state)
+    return results + state.known.ledger.finish()
 
 
 # -- the first frames --------------------------------------------------------------------------------------------------
@@ -127,35 +121,52 @@ def finish(state: State) -> list[FrameResult]:
 
 def _acquire(state: Acquiring, frame: Frame) -> tuple[State, list[FrameResult]]:
     """Take one of the first frames; they are received once they agree."""
-    known, before = state.known, state.frames
-    if before and not _are_alike(before.frames[0], frame):
-        after, results = _receive_first(known, before)
-        anew, more = _acquire(Acquiring(replace(after.known, camera=after.known.camera.of_frame(frame))), frame)
-        return anew, results + more
-    if state.alone is not None:
-        earlier, failure = state.alone
-        before = FirstFrames.in_changes(earlier, frame, known.camera) if _are_alike(earlier, frame) else None
-        if before is None or before.located.evidence < search_settings.few_packets:
-            after, results = _receive(Lost(known), earlier, failure)
-            anew, more = _acquire(Acquiring(after.known), frame)
-            return anew, results + more
-    frames = before.with_frame(frame, known.camera) if before else FirstFrames.begin(frame, known.camera)
-    if isinstance(frames, Failure):
-        if frames.status == "no_screen":
-            return Acquiring(known, alone=(frame, frames)), []
-        after, results = _receive(Lost(known), frame, frames)
-        return Acquiring(after.known), results
-    return _receive_first(known, frames) if frames.are_enough else (Acquiring(known, frames), [])
+    known, held = state.known, state.frames
+    if held is None:
+        return _go_on(known, HiddenFrames.begin(frame, known.camera, may_wait=state.may_wait))
+    if _are_alike(held.frames[0], frame):
+        return _go_on(known, held.with_frame(frame, known.camera))
+    after, results = _received(state)
+    anew, more = _acquire(Acquiring(replace(after.known, camera=after.known.camera.of_frame(frame))), frame)
+    return anew, results + more
 
 
 def _are_alike(frame: Frame, following: Frame) -> bool:
     return frame.pixels.shape == following.pixels.shape and frame.pixels.dtype == following.pixels.dtype
 
 
+def _received(state: State) -> tuple[State, list[FrameResult]]:
+    """Receive the first frames that wait for more, since none come."""
+    results: list[FrameResult] = []
+    while isinstance(state, Acquiring) and state.frames is not None:
+        state, more = _go_on(state.known, state.frames, are_all=True)
+        results += more
+    return state, results
+
+
+def _go_on(known: Known, held: HiddenFrames | FirstFrames, *, are_all: bool = False) -> tuple[State, list[FrameResult]]:
+    """Receive the first frames if they are enough; the first of them alone if it shows no screen and camera."""
+    if not (held.are_enough or are_all):
+        return Acquiring(known, held), []
+    if isinstance(held, FirstFrames):
+        return _receive_first(known, held)
+    shown = held.shown(known.camera)
+    if isinstance(shown, FirstFrames):
+        return _go_on(known, shown, are_all=are_all)
+    after, results = _receive(Lost(known), held.frames[0], shown)
+    state: State = Acquiring(after.known, may_wait=False)
+    for frame in held.frames[1:]:
+        state, more = step(state, frame)
+        results += more
+    return replace(state, may_wait=True) if isinstance(state, Acquiring) else state, results
+
+
 def _receive_first(known: Known, held: FirstFrames) -> _Step:
     """Receive the first frames, once they have agreed on an outline and, where each shows little, on a clock."""
     located = held.agreed()
-    if len(held.frames) > 1 and held.shows_little:
+    if held.start is not None:
+        known.ledger.start = held.start
+    elif len(held.frames) > 1 and held.shows_little:
         agreed = common_clock(held.frames, located.context, known.camera.options.screens)
         if agreed is not None:
             known.ledger.start, context = agreed
@@ -233,7 +244,9 @@ def _is_doubled(frame: Frame, before: Frame, corners: FloatArray | None) -> bool
     contrast = float(np.abs(np.diff(pixels, axis=0)).mean())
     if contrast < SETTINGS.min_contrast * (frame.white - frame.black):
         return False
-    return float(np.abs(pixels - earlier).mean()) < SETTINGS.same_share * contrast
+    # Texture has contrast as well, and through long exposures stripes change the level by little.
+    most = min(SETTINGS.same_share * contrast, SETTINGS.same_level_share * float(pixels.mean() - frame.black))
+    return float(np.abs(pixels - earlier).mean()) < most
 
 
 # -- a frame like a photograph -----------------------------------------------------------------------------------------

@@ -164,7 +164,8 @@ class TrackedScreen:
             lit = clock.on_grid(found.lit)
             positions = known_picture.row_positions(pose.rows, clock)
             fit = known_picture.fit_response(observed.columns, lit, positions, clock.exposure_slots)
-            expected = known_picture.expected_light(lit, positions, clock.exposure_slots, 1, fit.response).light
+            n_slots = int(np.ceil(clock.exposure_slots))
+            expected = known_picture.expected_light(lit, positions, clock.exposure_slots, n_slots, fit.response).light
             rows_per_slot, share = clock.rows_per_slot, SETTINGS.frame_share
             if picture.judge(observed.columns, expected, max_misfit, share, rows_per_slot) is None:
                 return None

@@ -48,20 +48,23 @@ class ClipSettings:
     #: Most slots by which the clock of a long exposure is moved in a frame.
     long_step: float = 0.25
 
-    #: First frames whose outlines are compared. First frames that are taken together: for the clock where each shows
+    #: First frames whose outlines are compared; first frames whose mean shows the picture's texture, and their slots
+    #: little. First frames that are taken together: for the clock where each shows
     #: little, for the phase of the bursts and for the picture; number where these leave doubt; and share of well lit
     #: packets in doubt.
     n_outlines: int = 5
+    n_for_texture: int = 16
     first_frames: int = 6
     frames_in_doubt: int = 24
     much_doubt: float = 0.03
     #: An estimated camera that gives this many times the evidence of packets replaces the named one.
     unlike_evidence: float = 4.0
     #: Points across and down the screen that are compared with the frame before; least change from row to row, in units
-    #: of white, and share of it by which a repeated frame may differ.
+    #: of white; and shares of it, and of the level, by which a repeated frame may differ.
     same_points: int = 32
     min_contrast: float = 0.01
     same_share: float = 0.25
+    same_level_share: float = 0.05
     #: How much longer than from one frame to the next a readout may seem to take: time stamps are rounded.
     readout_slack: float = 1.1
 

@@ -6,7 +6,6 @@ tests whether light without data explains the winner as well, and gives the reas
 """
 
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
-from rxcli.receiver.search.outlines import screen_in_changes
 from rxcli.receiver.search.search import search
 
-__all__ = ["Found", "Hypothesis", "Scored", "Tried", "screen_in_changes", "search"]
+__all__ = ["Found", "Hypothesis", "Scored", "Tried", "search"]

@@ -64,7 +64,7 @@ def known_lens(frame: Frame, options: ReceiverOptions) -> Lens | None:
 
 
 def propose_cameras(
-    cache: FrameCache, corners: FloatArray, options: ReceiverOptions, n_columns: int
+    cache: FrameCache, corners: FloatArray, options: ReceiverOptions, n_columns: int, *, may_bend: bool = True
 ) -> Generator[FrameCamera, None, Failure]:
     """Propose cameras of a frame, likeliest first; returns the reason if there are no others.
 
@@ -73,6 +73,7 @@ def propose_cameras(
         corners: (4, 2) of the screen.
         options: screens.
         n_columns: number of columns of the screen.
+        may_bend: whether the camera may have taken a distortion out.
     """
     frame, timer = cache.frame, cache.timer
     context = FrameContext(cache, corners, UNKNOWN, options.screens)
@@ -82,7 +83,7 @@ def propose_cameras(
     # A picture does not show the slot rate: the fastest screen represents all with the same packet length.
     screens = sorted(options.screens, key=lambda screen: -screen.slot_rate_hz)
     with timer("blind"):
-        hypotheses = propose(strips, screens, frame.metadata.exposure_s, may_bend=frame.mosaic is None)
+        hypotheses = propose(strips, screens, frame.metadata.exposure_s, may_bend=may_bend and frame.mosaic is None)
     for hypothesis in sorted(hypotheses, key=lambda h: h.number):
         screen = next(s for s in screens if s.packet_slots == hypothesis.packet_slots)
         yield estimated_camera(hypothesis, screen.slot_rate_hz, frame)
@@ -138,7 +139,9 @@ def relabelled_camera(camera: FrameCamera, screen: ScreenProfile, frame: Frame) 
     return estimated_camera(replace(hypothesis, stated_exposure_slots=stated), rate, frame)
 
 
-def settle(context: FrameContext, acquisition: Acquisition, reception: Reception) -> tuple[FrameCamera, float]:
+def settle(
+    context: FrameContext, acquisition: Acquisition, reception: Reception, *, may_bend: bool = True
+) -> tuple[FrameCamera, float]:
     """Fit an estimated camera to decoded slots; also return the largest shift of the clock, slots."""
     camera, screen, frame = context.camera, acquisition.screen, context.frame
     if camera.hypothesis is None:
@@ -151,7 +154,7 @@ def settle(context: FrameContext, acquisition: Acquisition, reception: Reception
             clock,
             clock.on_grid(reception.posteriors.lit),
             screen.light_spread,
-            may_bend=frame.mosaic is None,
+            may_bend=may_bend and frame.mosaic is None,
         )
     return estimated_camera(found, screen.slot_rate_hz, frame), moved_slots
 

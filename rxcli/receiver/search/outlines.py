@@ -14,13 +14,13 @@ from rxcli.receiver.decode.assemble import further_pictures
 from rxcli.receiver.frame.cache import FrameCache, key_of
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
-from rxcli.receiver.plane import changed_light, turned
+from rxcli.receiver.plane import turned
 from rxcli.receiver.plane.orientation import PORTRAIT
 from rxcli.receiver.screen import find, geometry
 from rxcli.receiver.screen.bright import bright_quadrilateral, striped_box
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.stripes import MIN_LEAN, stripe_lean
-from rxcli.receiver.search.cameras import DEFAULT_TONE, known_lens
+from rxcli.receiver.search.cameras import known_lens
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.types import FloatArray, Frame
 
@@ -124,14 +124,6 @@ def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
         if all(np.abs(outline.corners - own.corners).max() >= tolerance for outline in outlines[0]):
             outlines[0].append(own)
     return outlines
-
-
-def screen_in_changes(cache: FrameCache, following: Frame, options: ReceiverOptions) -> list[Outline]:
-    """Outlines of the clearest screen in what changed from a frame to another one; none if nothing did."""
-    with cache.timer("geometry"):
-        changes = changed_light(cache.frame, following, DEFAULT_TONE)
-    screens = possible_screens(FrameCache(changes), options)
-    return screens[0] if screens else []
 
 
 def layouts_of(options: ReceiverOptions) -> list[find.ColumnLayout]:

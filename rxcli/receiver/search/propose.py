@@ -35,12 +35,14 @@ class Proposer:
         options: screens and cameras.
         outlines: that the screen may have.
         known: the camera and the screens, if known from other frames.
+        may_bend: whether an unknown camera may have taken a distortion out.
     """
 
     cache: FrameCache
     options: ReceiverOptions
     outlines: tuple[Outline, ...]
     known: FrameContext | None = None
+    may_bend: bool = True
 
     def families(self) -> list[Outline]:
         """One outline of every family, likeliest first: packets are the same whichever column is the first."""
@@ -64,7 +66,7 @@ class Proposer:
         failure, n_proposed = None, 0
         usual = nearest_screen(self.options.screens, USUAL_COLUMNS).columns
         for outline in self.families():
-            cameras = propose_cameras(self.cache, outline.corners, self.options, usual)
+            cameras = propose_cameras(self.cache, outline.corners, self.options, usual, may_bend=self.may_bend)
             try:
                 while True:
                     if hypotheses := self._of_camera(next(cameras), -SETTINGS.next_camera * n_proposed):

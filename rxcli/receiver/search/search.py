@@ -43,6 +43,7 @@ def search(
     *,
     outlines: list[Outline] | None = None,
     budget: int = SETTINGS.budget,
+    may_bend: bool = True,
 ) -> Found | Failure:
     """Find outline, rows, camera, screen, clock and bursts of a frame.
 
@@ -52,25 +53,26 @@ def search(
         known: context of a frame of the same camera, if the camera and the screens are known.
         outlines: of the screen to receive; those of the clearest one in the picture if left out.
         budget: maximum number of initial passes.
+        may_bend: whether an unknown camera may have taken a distortion out, so that stripes are bent.
     """
     if outlines is None:
         screens = proposed_screens(cache, options)
         if isinstance(screens, Failure):
             return screens
         outlines = screens[0]
-    found = _search(cache, options, known, outlines, budget)
+    found = _search(cache, options, known, outlines, budget, may_bend)
     packets = _packet_evidence(found)
     if outlines[0].family < 0 or (packets and outlines[0].stands_out):
         return found
     without = without_borders(cache)
     if not without:
         return found
-    borderless = _search(cache, options, known, without, budget)
+    borderless = _search(cache, options, known, without, budget, may_bend)
     if options.corners is not None:
         if isinstance(borderless, Failure) or not _packet_evidence(borderless):
             return found
         # Of one column that sends alone, its own rows give the camera, and the corners its number.
-        numbered_by_corners = _search(cache, options, borderless.best.context, outlines, budget)
+        numbered_by_corners = _search(cache, options, borderless.best.context, outlines, budget, may_bend)
         return numbered_by_corners if _packet_evidence(numbered_by_corners) else found
     is_steady = isinstance(borderless, Failure) and borderless.message == STEADY_LIGHT and not packets
     return borderless if is_steady or _packet_evidence(borderless) > SETTINGS.borderless_gain * packets else found
@@ -84,10 +86,15 @@ def _packet_evidence(found: Found | Failure) -> float:
 
 
 def _search(
-    cache: FrameCache, options: ReceiverOptions, known: FrameContext | None, outlines: list[Outline], budget: int
+    cache: FrameCache,
+    options: ReceiverOptions,
+    known: FrameContext | None,
+    outlines: list[Outline],
+    budget: int,
+    may_bend: bool,
 ) -> Found | Failure:
     """`search` among outlines."""
-    proposer = Proposer(cache, options, tuple(outlines), known)
+    proposer = Proposer(cache, options, tuple(outlines), known, may_bend)
     if not outlines[0].stands_out:
         budget = SETTINGS.borderless_budget if outlines[0].family < 0 else SETTINGS.doubtful_budget
     walk = _Walk(proposer, budget)
@@ -162,7 +169,9 @@ class _Walk:
     def _fitted(self, best: Scored) -> Scored:
         """The same with an estimated camera fitted to its slots until the clock no longer moves."""
         for _ in range(camera_settings.max_fits if best.context.camera.hypothesis else 0):
-            camera, moved_slots = settle(best.context, best.acquisition, best.reception)
+            camera, moved_slots = settle(
+                best.context, best.acquisition, best.reception, may_bend=self._proposer.may_bend
+            )
             if moved_slots < camera_settings.matters_slots and best.evidence > SETTINGS.plain_estimate:
                 return best.with_camera(camera)
             hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
