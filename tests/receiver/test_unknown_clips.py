@@ -16,8 +16,10 @@ from rxcli.receiver.clip.common_clock import start_by
 from rxcli.receiver.clip.ledger import Ledger
 from rxcli.receiver.clip.views import Waiting
 from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.plane import without_texture
 from rxcli.receiver.receive import receive
+from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, cameras
 from rxcli.receiver.search.outlines import possible_screens
 from rxcli.results.truth import Truth
@@ -139,3 +141,35 @@ def test_a_scene_learns_from_its_own_frames_only(monkeypatch: pytest.MonkeyPatch
     timeline: Any = SimpleNamespace(number=lambda view: setattr(view, "numbers", np.zeros(0, int)))
     ledger._number_frames(timeline)
     assert learned == ["own"]
+
+
+class _Shown(Located):
+    """Packets of some evidence, of a short exposure or a long one."""
+
+    def __init__(self, evidence: float, is_long: bool = False) -> None:
+        super().__init__(Outline(np.zeros((4, 2))), None, None)
+        self.__dict__.update(shown=evidence, long=is_long)
+
+    evidence = property(lambda self: self.shown)
+    is_long = property(lambda self: self.long)
+
+
+@pytest.mark.parametrize(
+    ("there", "elsewhere", "is_taken_there"),
+    [
+        (_Shown(100), _Shown(90), True),
+        (_Shown(100), _Shown(110), False),
+        (_Shown(100, is_long=True), _Shown(110), True),
+        (_Shown(100), _Shown(110, is_long=True), True),
+        (Failure("no_signal", "none"), _Shown(50), False),
+        (Failure("no_signal", "none"), Failure("no_screen", "none"), True),
+    ],
+)
+def test_a_lost_screen_is_where_more_packets_are(
+    there: Any, elsewhere: Any, is_taken_there: bool, clip: Clip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Packets of a long exposure show on many outlines: it is taken to be where it was."""
+    monkeypatch.setattr(ClipCamera, "locate", lambda _, cache, outlines=None: there if outlines else elsewhere)
+    corners = np.ones((4, 2))
+    found = ClipCamera(clip.options).locate_again(FrameCache(clip.frames[0]), Outline(corners), corners)
+    assert found is (there if is_taken_there else elsewhere)
