@@ -50,7 +50,8 @@ class HiddenFrames:
         alone = self.alone
         if not isinstance(alone, Located):
             return False
-        return not alone.is_open or (alone.context.camera.hypothesis is None and shows_little(alone.context))
+        is_known = alone.context.camera.hypothesis is None
+        return alone.is_plain or (is_known and (not alone.is_open or shows_little(alone.context)))
 
     def with_frame(self, frame: Frame, camera: ClipCamera) -> HiddenFrames:
         """These frames and one more."""
@@ -74,22 +75,26 @@ class HiddenFrames:
 
         None where it shows no packets.
         """
-        n = len(self.frames)
-        flat = {number: FrameCache(self._flat(number)) for number in (0, n // 2, n - 1)}
-        if not shows_same(self.frames[0], flat[0].frame, DEFAULT_TONE):
+        n_frames, shown = len(self.frames), dict[int, Located]()
+        flat = FrameCache(self._flat(0))
+        if not shows_same(self.frames[0], flat.frame, DEFAULT_TONE):
             return None
-        located = {number: camera.locate(cache, may_bend=False) for number, cache in flat.items()}
-        shown = {n: each for n, each in located.items() if isinstance(each, Located) and self._may_be(each)}
+        for number in (0, n_frames // 2, n_frames - 1):
+            found = camera.locate(FrameCache(self._flat(number)) if number else flat, may_bend=False)
+            if isinstance(found, Located) and self._may_be(found):
+                shown[number] = found
+            elif isinstance(self.alone, Located) and self.alone.shows_packets and not self.alone.is_long:
+                break
         if not shown:
             return None
         surest = max(shown, key=lambda number: shown[number].evidence)
         outline = self._agreed({number: each.outline for number, each in shown.items()}, surest, camera)
         best = shown[surest]
         assert isinstance(best.found, Found)
-        alone = replace(camera, context=best.context).locate(flat[0], [outline], may_bend=False)
+        alone = replace(camera, context=best.context).locate(flat, [outline], may_bend=False)
         if isinstance(alone, Located) and self._may_be(alone):
             return FirstFrames(self.frames, alone, evidence=alone.evidence)
-        there = replace(best.context, cache=flat[0], sampled_corners=outline.corners)
+        there = replace(best.context, cache=flat, sampled_corners=outline.corners)
         located_there = Located(outline, there, None, best.framing)
         return FirstFrames(self.frames, located_there, start=start_by(best.found, self.frames), evidence=best.evidence)
 
