@@ -14,7 +14,7 @@ from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View
 from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.frame.settings import SETTINGS as pass_settings
-from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, slot_llr
+from rxcli.receiver.light import slot_llr
 from rxcli.receiver.still import llr_of
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, IntArray
 
@@ -73,7 +73,7 @@ class Burst:
             against = np.maximum(-self._llr[0, :, PREAMBLE_SLOTS:] * decided, 0).max(axis=1)
         else:
             margin = detect.slot_margin(self.metrics[None], self.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
-            is_long = view.acquisition.clock.exposure_slots > LONG_EXPOSURE_SLOTS
+            is_long = view.acquisition.clock.exposure_slots > SETTINGS.joint_slots
             undenoised, joint = np.zeros(margin.shape[1], bool), np.full(margin.shape[1], is_long)
             n_strips = view.acquisition.binned.light.shape[1]
             features = confidence.confidence_features(self.posteriors, margin, undenoised, n_strips, joint)[0]

@@ -285,12 +285,12 @@ def _receive_anew(
         acquired.context,
         acquisition,
         _bursts_of(frame, reception),
-        1 if reception.is_long else reception.model.exposure.isi_memory,
+        1 if _is_joint(reception) else reception.model.exposure.isi_memory,
         frame.height,
         reception.snr,
         denoised,
         framing=framing_of(acquisition, acquired.initial, acquired.screens),
-        joint=JointSlots.of(reception.clock, reception.posteriors) if reception.is_long else None,
+        joint=JointSlots.of(reception.clock, reception.posteriors) if _is_joint(reception) else None,
     )
     if not _can_track(acquired, options):
         return Lost(known), view, report
@@ -312,9 +312,14 @@ def _can_track(acquired: Acquired, options: ReceiverOptions) -> bool:
     )
 
 
+def _is_joint(reception: Reception) -> bool:
+    """Whether the frames of a clip like this one decide slots and what is not known of the picture together."""
+    return reception.clock.exposure_slots > SETTINGS.joint_slots
+
+
 def _bursts_of(frame: Frame, reception: Reception) -> tracking.FrameBursts:
     shown = np.minimum(assemble.slots_observed(reception.samples, reception.clock.by_copy), 1)
     metrics = reception.metrics
-    if reception.is_long:
+    if _is_joint(reception):
         metrics = by_copy_metrics(np.asarray(0.5 + 0.5 * np.tanh(slot_llr(metrics) / 2), np.float32))
     return tracking.FrameBursts(frame.index, 0, reception.clock, metrics, shown)

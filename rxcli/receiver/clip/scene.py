@@ -20,7 +20,7 @@ from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.settings import STILL
-from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MIN_VARIANCE, Crosstalk, Exposure, NoiseModel, SlotLight
+from rxcli.receiver.light import MIN_VARIANCE, Crosstalk, Exposure, NoiseModel, SlotLight
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
@@ -110,7 +110,7 @@ class TrackedScreen:
             clock = self._clock(frame, columns, last.acquisition.clock, timeline.time)
         if clock is None:
             return None
-        if clock.exposure_slots > LONG_EXPOSURE_SLOTS:
+        if clock.exposure_slots > SETTINGS.joint_slots:
             bursts, observed = timeline.assigned(frame, clock), _Observed(pose.rows, light, columns, 1)
             return self._long_view(cache, observed, picture, clock, bursts, max_misfit)
         with timer("detect"):
@@ -222,7 +222,7 @@ class TrackedScreen:
 
         contrast, clock = with_contrast(0.0)
         # Of long exposures headers are too faint to place the clock; evidence does, see `lateness`.
-        is_known = time.is_measured and old.exposure_slots > LONG_EXPOSURE_SLOTS
+        is_known = time.is_measured and old.exposure_slots > SETTINGS.joint_slots
         if contrast < SETTINGS.good_header and not is_known:
             slots = np.arange(-time.sure_slots, time.sure_slots + SETTINGS.clock_step, SETTINGS.clock_step)
             best = max(map(with_contrast, slots.tolist()), key=itemgetter(0))

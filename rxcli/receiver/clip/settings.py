@@ -9,7 +9,9 @@ from dataclasses import dataclass
 class ClipSettings:
     """Each with its unit and the reason for it."""
 
-    #: Share of the slots of a long exposure that are wrong where a copy is detected by itself.
+    #: Exposure in slots from which slots and what is not known of the picture are decided together.
+    joint_slots: float = 1.7
+    #: Share of the slots of such an exposure that are wrong where a copy is detected by itself.
     wrong_slots: float = 0.08
     #: Maximum number of strips of a column: more do not improve a known picture, and take time.
     max_strips: int = 4

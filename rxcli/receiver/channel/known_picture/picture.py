@@ -242,7 +242,7 @@ def _error_correlation(weighted: Float32Array, precision: Float32Array, rows_per
     n = max(round(rows_per_slot), 1)
     n_slots = precision.shape[1] // n
     total, predicted = (
-        values[:, : n_slots * n].reshape(-1, n_slots, n) @ np.ones(n, np.float32) for values in (weighted, precision)
+        values[:, : n_slots * n].reshape(-1, n_slots, n).sum(axis=2) for values in (weighted, precision)
     )
     used = predicted > SETTINGS.min_slot_precision
     # Means, because medians underestimate the correlation and give wrong packets with high confidence.
