@@ -44,7 +44,7 @@ def _line_delay_s(clip: Clip) -> float:
     return float(clip.truth.camera["line_delay_s"])
 
 
-@pytest.mark.parametrize("exposure_slots", [2.0, 4.0])
+@pytest.mark.parametrize("exposure_slots", [3.0, 4.0])
 def test_a_clip_of_long_exposures_is_received(exposure_slots: float) -> None:
     clip = simulate(8, 7, picture="grey", exposure_slots=exposure_slots, height_scale=1.0)
     results, score = scored(list(receive(clip.frames, _unknown(clip))), clip.truth)
