@@ -274,6 +274,7 @@ def _both_ways(
     rows, length = clock.rows, clock.length
     common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
     common += 2 * min(clock.strength, SETTINGS.max_line)
+    off_slots = SETTINGS.period_error[clock.found > LONG_EXPOSURE_SLOTS]
     for is_reversed, header in enumerate(_header_peaks(total, rows, length)):
         yield CameraHypothesis(
             rows_per_slot=rows * pitch,
@@ -283,11 +284,7 @@ def _both_ways(
             exposure_slots=clock.stated or clock.found,
             score=max(header, 0.0) ** 2 + common,
             # A period that is off by a part of a slot over the picture shows as well.
-            rows_per_slot_sd=rows
-            * rows
-            * pitch
-            * SETTINGS.period_error[clock.found > LONG_EXPOSURE_SLOTS]
-            / copies.size,
+            rows_per_slot_sd=rows * rows * pitch * off_slots / copies.size,
             curvature_sd=np.abs(bend) / 4,
             stated_exposure_slots=clock.stated,
         )

@@ -81,7 +81,7 @@ class HiddenFrames:
             return None
         for number in (0, n_frames // 2, n_frames - 1):
             found = camera.locate(FrameCache(self._flat(number)) if number else flat, may_bend=False)
-            if isinstance(found, Located) and self._may_be(found):
+            if isinstance(found, Located) and self._was_hidden(found):
                 shown[number] = found
             elif isinstance(self.alone, Located) and self.alone.shows_packets and not self.alone.is_long:
                 break
@@ -92,11 +92,11 @@ class HiddenFrames:
         best = shown[surest]
         assert isinstance(best.found, Found)
         alone = replace(camera, context=best.context).locate(flat, [outline], may_bend=False)
-        if isinstance(alone, Located) and self._may_be(alone):
-            return FirstFrames(self.frames, alone, evidence=alone.evidence)
+        if isinstance(alone, Located) and self._was_hidden(alone):
+            return FirstFrames(self.frames, alone)
         there = replace(best.context, cache=flat, sampled_corners=outline.corners)
-        located_there = Located(outline, there, None, best.framing)
-        return FirstFrames(self.frames, located_there, start=start_by(best.found, self.frames), evidence=best.evidence)
+        located = Located(outline, there, None, best.framing)
+        return FirstFrames(self.frames, located, start=start_by(best.found, self.frames))
 
     def _agreed(self, outlines: dict[int, Outline], surest: int, camera: ClipCamera) -> Outline:
         """The median of outlines of some frames, where it is in the first; of two the surest."""
@@ -107,8 +107,8 @@ class HiddenFrames:
         agreed = np.median(list(corners.values()), axis=0) if len(corners) > 2 else corners[surest]
         return replace(outline, corners=agreed, strips=None, grid=None)
 
-    def _may_be(self, located: Located) -> bool:
-        """Whether packets were found that the texture may have hidden."""
+    def _was_hidden(self, located: Located) -> bool:
+        """Whether packets were found that the texture had hidden."""
         return located.shows_packets and (located.is_long or isinstance(self.alone, Failure))
 
     def _flat(self, number: int) -> Frame:
@@ -134,8 +134,6 @@ class FirstFrames:
     differences: tuple[FloatArray, ...] = ()
     #: The clock that another of them shows, where the first does not.
     start: Start | None = None
-    #: Of the packets in the surest of them.
-    evidence: float = 0.0
 
     @classmethod
     def begin(cls, frame: Frame, camera: ClipCamera, located: Located) -> FirstFrames:
@@ -143,6 +141,11 @@ class FirstFrames:
         corners = located.context.sampled_corners
         texture = None if camera.options.corners is not None else ScreenTexture(frame, corners, None)
         return cls((frame,), located, texture, (np.zeros_like(corners),))
+
+    @property
+    def evidence(self) -> float:
+        """Of the packets in the first of them, or in the one that shows the clock."""
+        return self.located.evidence if self.start is None else self.start.log_evidence
 
     @property
     def shows_little(self) -> bool:

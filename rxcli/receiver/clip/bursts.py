@@ -73,8 +73,8 @@ class Burst:
             against = np.maximum(-self._llr[0, :, PREAMBLE_SLOTS:] * decided, 0).max(axis=1)
         else:
             margin = detect.slot_margin(self.metrics[None], self.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
-            is_long = view.acquisition.clock.exposure_slots > SETTINGS.joint_slots
-            undenoised, joint = np.zeros(margin.shape[1], bool), np.full(margin.shape[1], is_long)
+            is_joint = view.acquisition.clock.exposure_slots > SETTINGS.joint_slots
+            undenoised, joint = np.zeros(margin.shape[1], bool), np.full(margin.shape[1], is_joint)
             n_strips = view.acquisition.binned.light.shape[1]
             features = confidence.confidence_features(self.posteriors, margin, undenoised, n_strips, joint)[0]
         index = self.number - int(view.numbers[0])

@@ -20,7 +20,7 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.search import Found
 from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.sync.settings import SETTINGS as sync_settings
-from rxcli.receiver.sync.tracking import LinkTime
+from rxcli.receiver.sync.tracking import LinkTime, slot_of_row_0
 from rxcli.types import Clock, FloatArray, Frame, RowProfiles
 
 
@@ -73,9 +73,9 @@ def start_by(found: Found, frames: Sequence[Frame]) -> Start:
     best = found.best
     screen, clock, frame = best.acquisition.screen, best.reception.clock, best.context.frame
     period = _period_s(frames) * screen.slot_rate_hz
-    slot = clock.first_slot - clock.row0 / clock.rows_per_slot
+    slot = slot_of_row_0(clock) - (frame.index - frames[0].index) * period
     time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
-    time.begin(frames[0].index, frames[0].time_s, slot - (frame.index - frames[0].index) * period, period)
+    time.begin(frames[0].index, frames[0].time_s, slot, period)
     return Start(screen, best.acquisition.variants, time, clock.header_peak_ratio, best.evidence)
 
 

@@ -50,12 +50,12 @@ class ClipSettings:
     #: Most slots by which the clock of a long exposure is moved in a frame.
     long_step: float = 0.25
 
-    #: First frames whose outlines are compared; first frames whose mean shows the picture's texture, and their slots
-    #: little. First frames that are taken together: for the clock where each shows
+    #: First frames whose mean shows the texture of the picture, and little of their slots.
+    n_for_texture: int = 16
+    #: First frames whose outlines are compared. First frames that are taken together: for the clock where each shows
     #: little, for the phase of the bursts and for the picture; number where these leave doubt; and share of well lit
     #: packets in doubt.
     n_outlines: int = 5
-    n_for_texture: int = 16
     first_frames: int = 6
     frames_in_doubt: int = 24
     much_doubt: float = 0.03

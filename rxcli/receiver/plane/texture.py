@@ -37,9 +37,9 @@ def without_texture(frame: Frame, frames: Sequence[Frame], tone: str) -> Frame:
 
     table = _light_of_values(frame, tone)
     light = table.take(frame.pixels)
-    mean = np.zeros_like(light)
+    mean, texture = np.zeros_like(light), _gradient(light)
     for each in frames:
-        mean += _moved(table.take(each.pixels), light)
+        mean += _moved(table.take(each.pixels), texture)
     mean /= np.float32(len(frames))
     light *= cv2.blur(mean, (1, round(_LEVEL_SHARE * frame.height)))
     light /= mean
@@ -49,7 +49,7 @@ def without_texture(frame: Frame, frames: Sequence[Frame], tone: str) -> Frame:
 
 
 def shows_same(frame: Frame, flat: Frame, tone: str) -> bool:
-    """Whether a frame shows what the others do that its texture was taken out by, and not another picture.
+    """Whether a frame shows the picture whose texture was taken out of it.
 
     Args:
         frame: a frame.
@@ -63,30 +63,30 @@ def shows_same(frame: Frame, flat: Frame, tone: str) -> bool:
 def shift_of_texture(frame: Frame, to: Frame, tone: str) -> FloatArray:
     """(2,) pixels x and y from where the texture of a frame is to where it is in another one."""
     table = _light_of_values(frame, tone)
-    return _shift(table.take(frame.pixels), table.take(to.pixels))
+    return _shift(table.take(frame.pixels), _gradient(table.take(to.pixels)))
 
 
-def _moved(light: Float32Array, to: Float32Array) -> Float32Array:
-    """The light of a frame, moved so that its texture is where it is in another one."""
+def _moved(light: Float32Array, texture: Float32Array) -> Float32Array:
+    """The light of a frame, moved so that its texture is where that of another one is."""
     import cv2
 
-    shift = _shift(light, to)
+    shift = _shift(light, texture)
     if np.abs(shift).max() < _STILL_PX:
         return light
     motion = np.array([[1, 0, shift[0]], [0, 1, shift[1]]])
     return np.asarray(cv2.warpAffine(light, motion, light.shape[::-1], borderMode=cv2.BORDER_REPLICATE))
 
 
-def _shift(light: Float32Array, to: Float32Array) -> FloatArray:
-    """(2,) pixels x and y by which the texture of a frame is further left and up than that of another one."""
+def _shift(light: Float32Array, texture: Float32Array) -> FloatArray:
+    """(2,) pixels x and y by which the texture of light is further left and up than that of another frame."""
     import cv2
 
-    shift, _ = cv2.phaseCorrelate(_gradient(light), _gradient(to))
+    shift, _ = cv2.phaseCorrelate(_gradient(light), texture)
     return 2 * np.array(shift)
 
 
 def _gradient(light: Float32Array) -> Float32Array:
-    """Changes of the logarithm of light along the rows, which stripes leave alone, at half the size."""
+    """Texture: changes of the logarithm of light along the rows, which stripes leave alone, at half the size."""
     import cv2
 
     half = cv2.resize(light, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)

@@ -69,14 +69,14 @@ class LinkTime:
 
     def first_copy(self, slot: float, clock: Clock) -> int:
         """Number of a clock's copy 0 where sensor row 0 is nearest to a predicted `slot`."""
-        return round((slot - _slot_of_row_0(clock)) / self.packet_slots)
+        return round((slot - slot_of_row_0(clock)) / self.packet_slots)
 
     def update(self, frame: int, time_s: float, clock: Clock) -> int | None:
         """Enter the clock of a frame; return the number of its copy 0, or None if it contradicts the link time.
 
         `time_s` is the frame's time stamp.
         """
-        inside = _slot_of_row_0(clock)
+        inside = slot_of_row_0(clock)
         predicted = self.predict(frame, time_s)
         if predicted is None:
             first_copy, slot = 0, inside
@@ -163,8 +163,8 @@ class LinkTime:
         )
 
 
-def _slot_of_row_0(clock: Clock) -> float:
-    """From the start of copy 0."""
+def slot_of_row_0(clock: Clock) -> float:
+    """Slot of sensor row 0 on a clock, from the start of copy 0."""
     return clock.first_slot - clock.row0 / clock.rows_per_slot
 
 
