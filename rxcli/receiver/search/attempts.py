@@ -68,7 +68,7 @@ def _receive_stated(cache: FrameCache, options: ReceiverOptions, receive: _Recei
     evidence = max((step.evidence for step in stated.result.search), default=0.0)
     for attempt, estimating in _with_estimates(cache, options):
         is_plain = best.n_believable >= _PLAIN_LONG and _is_long(best.result, cache.frame, options)
-        is_plain |= best.n_believable > 1 and evidence > SETTINGS.plain
+        is_plain |= sum(packet.confidence >= _SURE for packet in best.result.packets) > 1 and evidence > SETTINGS.plain
         # Without a hypothesis of the camera its exposure did not count.
         if not _gives_few(best.result) or is_plain or (attempt is not cache and not received.result.search):
             break

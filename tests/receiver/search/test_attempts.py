@@ -14,22 +14,23 @@ from rxcli.types import ColumnResult, Frame, FrameResult, Metadata, PacketResult
 
 
 @pytest.mark.parametrize(
-    ("evidence", "n_packets", "wanted"),
+    ("evidence", "n_packets", "confidence", "wanted"),
     [
-        (500.0, 2, [-np.inf]),  # plain, however few of its columns are lit
-        (500.0, 1, [-np.inf, 500.0]),  # one packet is no evidence
-        (300.0, 2, [-np.inf, 300.0]),
-        (300.0, 10, [-np.inf]),
+        (500.0, 2, 0.9, [-np.inf]),  # plain, however few of its columns are lit
+        (500.0, 1, 0.9, [-np.inf, 500.0]),  # one packet is no evidence
+        (500.0, 2, 0.8, [-np.inf, 500.0]),  # of a wrong exposure some are believed
+        (300.0, 2, 0.9, [-np.inf, 300.0]),
+        (300.0, 10, 0.9, [-np.inf]),
     ],
 )
 def test_an_exposure_is_doubted_by_few_packets_of_little_evidence(
-    evidence: float, n_packets: int, wanted: list[float]
+    evidence: float, n_packets: int, confidence: float, wanted: list[float]
 ) -> None:
     asked: list[float] = []
 
     def receive(cache: FrameCache, _: ReceiverOptions, least: float) -> Received:
         asked.append(least)
-        packets = (PacketResult(0.0, 1.0, 8, "00", 0.9, 0.0),)
+        packets = (PacketResult(0.0, 1.0, 8, "00", confidence, 0.0),)
         columns = tuple(ColumnResult(number, "ok", packets=packets * (number < n_packets)) for number in range(20))
         step = SearchStep("", 0.0, evidence, evidence, "won")
         return Received(FrameResult("photo", 0, 0.0, "ok", columns=columns, search=(step,)), {})
