@@ -4,8 +4,6 @@
 knowledge from frame to frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace

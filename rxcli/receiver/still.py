@@ -1,7 +1,5 @@
 """Reception of a still from its clock: light model and detection in turn. Part of the wiring."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Why a picture cannot be received: what it looks like, and the next step."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rxcli.numerics import TINY

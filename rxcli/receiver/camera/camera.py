@@ -1,7 +1,5 @@
 """What a camera hypothesis means for the receiver, the report and the next picture."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

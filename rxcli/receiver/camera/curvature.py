@@ -1,7 +1,5 @@
 """The bend of the stripes in a picture whose lens distortion was taken out in the camera."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rxcli.receiver.camera.settings import SETTINGS

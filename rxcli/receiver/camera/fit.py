@@ -4,8 +4,6 @@ The slots, as probabilities seen through the exposure, predict the light of ever
 is the derivative with respect to time.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

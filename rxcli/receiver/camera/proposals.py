@@ -6,8 +6,6 @@ its own complement, so the sign gives the direction of readout. The bend of the 
 similarity of neighbouring columns; `fit` estimates it from the decoded slots.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache

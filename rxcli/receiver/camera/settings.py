@@ -1,7 +1,5 @@
 """Numbers of policy of the estimate of an unknown camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """Strips of columns: the light of a picture, two strips a column, before anything is known of its camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Metrics of slot patterns, and their conversion between the grid of a frame and bursts."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache

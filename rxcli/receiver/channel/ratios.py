@@ -1,7 +1,5 @@
 """Samples for the joint detection of slots and picture: light relative to its local mean, copies side by side."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Settings of the observation model that neither physics nor the picture determine."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

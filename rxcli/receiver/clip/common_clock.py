@@ -4,8 +4,6 @@ A frame that shows less than two packets may show no whole header, or show paylo
 after the other, as far apart as in time, show the headers of all of them at the same place in the packet's length.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Bursts that go on from frame to frame, and frames whose results wait for them."""
 
-from __future__ import annotations
-
 from collections import deque
 from functools import partial
 

@@ -5,8 +5,6 @@
 like a photograph, with the camera and the link's time that are still believed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any

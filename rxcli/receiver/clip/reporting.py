@@ -1,7 +1,5 @@
 """The result of a frame of a clip: the packets of the bursts that it shows last."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any

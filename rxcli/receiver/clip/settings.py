@@ -1,7 +1,5 @@
 """Settings of clips: what is carried over from frame to frame, and when it is checked."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """Turn posteriors into results: packets with confidence, column status, frame status."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property

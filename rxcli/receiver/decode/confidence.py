@@ -3,8 +3,6 @@
 The weights are fitted data, `models/confidence`.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass
 from functools import lru_cache

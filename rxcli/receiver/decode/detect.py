@@ -7,8 +7,6 @@ Trans. Inf. Theory 20(2), 1974). Header and dimming symbol are known once the we
 are fixed, and the sum over all paths is the evidence for `w`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from math import comb

@@ -1,7 +1,5 @@
 """Settings of detection and reporting."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

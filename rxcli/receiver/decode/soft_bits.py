@@ -1,7 +1,5 @@
 """Soft bits of whole and cut packets for the link layer, limited by the confidence of the packet."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

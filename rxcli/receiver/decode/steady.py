@@ -8,8 +8,6 @@ Columns are independent transmitters. If all of them show the same light, it com
 counts once.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from rxcli.numerics import TINY

@@ -1,7 +1,5 @@
 """The camera of a frame: from its profile, or from an estimate."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Where and how the light of a frame is read: outline, camera and screens."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

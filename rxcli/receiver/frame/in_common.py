@@ -1,7 +1,5 @@
 """Name what a screen sends first in a laboratory: the same in all columns, or one column alone. Part of the wiring."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Settings of the presence of packets, and of the passes of a still."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

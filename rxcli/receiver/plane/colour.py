@@ -5,8 +5,6 @@ light, they are as large in red as in green, or red has none. Stripes are wider 
 left out by comparing with green in the cells beside.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 

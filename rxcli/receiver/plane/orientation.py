@@ -1,7 +1,5 @@
 """Photographs that were turned by 90 degrees after they were taken, so that columns lie along the picture's rows."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

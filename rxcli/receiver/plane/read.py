@@ -8,8 +8,6 @@ A mosaic is read without demosaicing: each row's pixels are weighted so that eve
 green and blue, in cells of whole periods of its colours.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any

@@ -6,8 +6,6 @@ is the noise. Slots are wider than rows: each octave of widths is taken by itsel
 error. Where a camera took its lens's distortion out, sensor rows are bent, as neighbouring cells show.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 

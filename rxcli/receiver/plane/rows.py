@@ -5,8 +5,6 @@ strip, but not how its light changes from row to row. Room light and the linear 
 small to cost packets.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -4,8 +4,6 @@ The texture hides the slots of a long exposure, which change the light by little
 hardly their slots, which differ from frame to frame.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -7,8 +7,6 @@ curve is near a power law; and the picture is learned from the same samples. `rx
 takes ten times as long.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

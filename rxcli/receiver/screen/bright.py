@@ -3,8 +3,6 @@
 A checkerboard or a page of text shown on the screen hides the borders of the columns, but not the screen's four sides.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,8 +6,6 @@ identify the first column (`numbering`); light along the columns gives the first
 proposes outlines with log-odds and leaves the decision to the search.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ No pixel is warped. The screen's corners give a homography from the screen plane
 model carries points on to the stored picture, and each strip's edges become x as a function of the picture row.
 """
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

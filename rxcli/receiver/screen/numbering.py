@@ -5,8 +5,6 @@ measured in eighths of a column: the edge of a screen lies on a column border, w
 does so by chance only. The weights of the features are fitted data, `models/numbering`.
 """
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Where a screen is in a picture."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

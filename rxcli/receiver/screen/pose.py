@@ -5,8 +5,6 @@ each strip on the slots of its columns gives the strip's distance from its place
 the grid. The corners follow the columns; top and bottom turn with them.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

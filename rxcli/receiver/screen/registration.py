@@ -11,8 +11,6 @@ one after the other, so that a steady motion of the camera shears and stretches 
 too, and a row remains one instant. See Lucas and Kanade 1981.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from typing import Any

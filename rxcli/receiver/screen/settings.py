@@ -1,7 +1,5 @@
 """Settings of the registration of clips, each with its unit and the reason for it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

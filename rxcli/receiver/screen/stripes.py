@@ -1,7 +1,5 @@
 """Direction of the stripes in a picture: a screen that sends shows them across its columns."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Other ways to read a photograph that gives few packets: with an estimated camera, and turned by 90 degrees."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from math import inf, log

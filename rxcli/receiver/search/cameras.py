@@ -1,7 +1,5 @@
 """Cameras of a frame: from a profile, or proposed from the picture and fitted to decoded slots."""
 
-from __future__ import annotations
-
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 

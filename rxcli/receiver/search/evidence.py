@@ -1,7 +1,5 @@
 """Evidence of a hypothesis: the log-likelihood ratio of packets in its initial pass."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rxcli.numerics import TINY

@@ -5,8 +5,6 @@ a burst look like those of two while they show different slots. Such framings of
 evidence of the same light, and a header that should show and does not counts against it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

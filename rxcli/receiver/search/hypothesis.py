@@ -1,7 +1,5 @@
 """Hypotheses about a picture, and their results."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Self
 

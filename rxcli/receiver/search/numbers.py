@@ -3,8 +3,6 @@
 Outlines of one family share all columns but the outermost. A column of the screen has packets, one beyond it has none.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Outlines of the screens in a frame, given or proposed by the finder; or why there are none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Propose hypotheses with log priors, likeliest first. Nothing is decided here."""
 
-from __future__ import annotations
-
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -3,8 +3,6 @@
 A periodic waveform or a single lamp may explain the light as well as packets do.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

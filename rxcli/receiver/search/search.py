@@ -1,7 +1,5 @@
 """Best-first search: make an initial pass of the likeliest hypothesis; its score determines the next one."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Generator
 from dataclasses import replace

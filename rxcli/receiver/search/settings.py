@@ -1,7 +1,5 @@
 """Settings of the search: outlines, weight of evidence, end of the search, distance of rivals, light without data."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -6,8 +6,6 @@ clock is the start with the largest header correlation over all visible copies. 
 of different bursts are not, which gives the burst boundaries.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Settings of clock recovery, burst assignment and the link time of a clip."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -5,8 +5,6 @@ counts slots from the clip's first clock, which numbers every copy of a packet. 
 a burst, which numbers every burst, including those in the gaps between frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """Frames without the texture that they have in common."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

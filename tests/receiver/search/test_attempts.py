@@ -1,7 +1,5 @@
 """Further attempts at a photograph that gives few packets: none where the first one leaves no doubt of its camera."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

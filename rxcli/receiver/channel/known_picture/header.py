@@ -1,7 +1,5 @@
 """Initial slot decisions, and the contrast of headers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL

@@ -1,7 +1,5 @@
 """Log-likelihood of the light for every slot pattern."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

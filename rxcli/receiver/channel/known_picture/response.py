@@ -1,7 +1,5 @@
 """Response of camera and compression to exposed slots, fitted in every frame."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

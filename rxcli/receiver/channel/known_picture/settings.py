@@ -1,7 +1,5 @@
 """Settings of the picture known from earlier frames."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 
