@@ -33,6 +33,9 @@ MIN_PERIODS, FEW_PERIODS = 2.0, 6
 _FEW_SCORE = 0.6
 #: Relative gain of explained variance at which a sub-harmonic is taken for the fundamental.
 _SUBHARMONIC_SHARE = 0.08
+#: Fewest periods of a candidate, whose frequency is not exact yet; and share of the strongest candidate's power from
+#: which one is fitted.
+_CANDIDATE_PERIODS, _CANDIDATE_SHARE = 1.5, 0.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,14 +169,16 @@ def fit_fundamental(profile: FloatArray, frequency: float, first_row: int = 0) -
     # With one limit for all, or the slow part of a fast candidate would follow the stripes themselves.
     max_slow = max(frequency * n, 2.0)
     candidates = (frequency * ratio for ratio in (3, 2, 1, 1 / 2, 1 / 3))
-    inside = [f for f in candidates if 1.5 / n <= f <= MAX_FREQUENCY]
+    inside = [f for f in candidates if _CANDIDATE_PERIODS / n <= f <= MAX_FREQUENCY]
     (rows, slow), flat = _rows_and_slow(n, 4), _detrend(profile, 4)
     # The power of five harmonics beside a cubic.
     bases = (np.linalg.qr(np.hstack([slow, *_waves(rows, f, 5)]))[0] for f in inside)
     shares = [float(np.sum((flat @ basis[:, 4:]) ** 2)) for basis in bases]
     best: PeriodicFit | None = None
     for candidate, share in zip(inside, shares, strict=True):
-        fit = fit_periodic(profile, candidate, first_row, max_slow) if share >= 0.6 * max(shares) else None
+        if share < _CANDIDATE_SHARE * max(shares):
+            continue
+        fit = fit_periodic(profile, candidate, first_row, max_slow)
         if fit and (best is None or (fit.beats(best) and fit.explained > best.explained * (1 + _SUBHARMONIC_SHARE))):
             best = fit
     return best

@@ -171,27 +171,29 @@ def _picture_of(data: bytes) -> tuple[bytes, bool, bool]:
     Stray bytes, notes of programs and what follows the picture are left out. The last three bytes of a scan's header
     mean nothing in a sequential picture, and are set as ITU-T T.81, table B.3, asks.
     """
-    parts, scan_at, lacking, sort = [b"\xff\xd8"], 0, 1, 0
+    # Coefficients that no scan has given yet are counted over the blocks of all components.
+    parts, scan_at, n_missing, frame_marker = [b"\xff\xd8"], 0, 1, 0
     for marker, start, end in segments(data, beyond_scan=True):
         if scan_at:
             parts.append(data[scan_at : start - 4])
-        if marker == _END or (scan_at and lacking <= 0):
+        if marker == _END or (scan_at and n_missing <= 0):
             break
         content = data[start:end]
         if marker in _FRAMES:
-            sort, lacking = marker, _BLOCK * (content + bytes(6))[5]
+            frame_marker, n_missing = marker, _BLOCK * (content + bytes(6))[5]
         elif marker == _SCAN and len(content) > 3:
-            content = content[:-3] + b"\0\x3f\0" if sort in _SEQUENTIAL else content
+            content = content[:-3] + b"\0\x3f\0" if frame_marker in _SEQUENTIAL else content
             start_k, end_k, precision = content[-3:]
-            is_exact = precision & 15 == 0
-            lacking -= content[0] * ((end_k + 1 - start_k) * is_exact if sort in _PROGRESSIVE else _BLOCK)
+            is_last_bit = precision & 15 == 0
+            n_of_block = (end_k + 1 - start_k) * is_last_bit if frame_marker in _PROGRESSIVE else _BLOCK
+            n_missing -= content[0] * n_of_block
         if marker not in _NOTES or (marker == _ADOBE and content[11:12] in (b"\0", b"\1", b"\2")):
             parts.append(struct.pack(">BBH", 0xFF, marker, len(content) + 2) + content)
         scan_at = end if scan_at or marker == _SCAN else 0
     else:
         marker = 0
         parts.append(data[scan_at:] if scan_at else b"")
-    return b"".join([*parts, b"\xff\xd9"]), marker == _END, lacking <= 0 and sort < _ARITHMETIC
+    return b"".join([*parts, b"\xff\xd9"]), marker == _END, n_missing <= 0 and frame_marker < _ARITHMETIC
 
 
 def _is_surplus(picture: bytes, reason: str, has_end: bool) -> bool:

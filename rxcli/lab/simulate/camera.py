@@ -32,6 +32,8 @@ _MOTION_ROUNDS = 4
 DECAY_TIMES, _GLARE_POINTS = 8, 200
 #: Breadth of the dark frame around the panel, in screen widths.
 _BEZEL_WIDTHS = 0.035
+#: Sensor pixels per panel pixel from which the three colour stripes of one can be resolved.
+_RESOLVED_PX = 1.2
 
 
 @dataclass(frozen=True)
@@ -146,7 +148,7 @@ class Exposure:
     def texture_scale(self) -> tuple[int, int]:
         """Texture pixels per panel pixel, down and across: three where its colour stripes can be resolved, else one."""
         magnification = self.view.pixels_per_width / self.drive.grey.shape[1]
-        return (3, 3) if self.scene.panel > 0 and magnification > 1.2 else (1, 1)
+        return (3, 3) if self.scene.panel > 0 and magnification > _RESOLVED_PX else (1, 1)
 
     @cached_property
     def textures(self) -> tuple[Float32Array, ...]:

@@ -73,7 +73,7 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
                 return self._shown(scene, rng)
 
     def _taken(self, rng: Generator) -> Scene:
-        """Camera, screen, exposure and place."""
+        """Draw camera, screen, exposure and place."""
         name, screen = str(rng.choice(self.cameras)), str(rng.choice(self.screens))
         scene, readout_s = preset(name, screen), log_uniform(rng, self.readout_s)
         if name.startswith("phone"):
@@ -95,7 +95,7 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         return placed(scene, rng.uniform(*self.fill), (roll + 180 * turned, yaw, pitch), place)
 
     def _shown(self, scene: Scene, rng: Generator) -> tuple[Scene, str]:
-        """Picture, weights and room."""
+        """Add picture, weights and room to a scene; also return the kind of picture."""
         size = scene.screen.width_px, scene.screen.height_px
         dark = rng.random() < self.dark
         kind = str(rng.choice(DARK_KINDS if dark else _BRIGHT))

@@ -206,9 +206,9 @@ def sent_slots(exposure: Exposure, clock: Clock) -> NDArray[np.uint8]:
     slots_per_row = exposure.scene.sensor.line_delay_s * exposure.slot_rate_hz
     rows = clock.row0 + clock.delay_slots * clock.rows_per_slot
     centre = exposure.start_slot + rows * slots_per_row + exposure.exposure_slots / 2
-    first = np.rint(centre - exposure.delays).astype(np.int64)
-    sent = exposure.link.slots(int(first.min()), int(first.max()) + clock.n_slots)
-    index = (first - first.min())[:, None] + np.arange(clock.n_slots)
+    first_slot = np.rint(centre - exposure.delays).astype(np.int64)
+    sent = exposure.link.slots(int(first_slot.min()), int(first_slot.max()) + clock.n_slots)
+    index = (first_slot - first_slot.min())[:, None] + np.arange(clock.n_slots)
     return np.asarray(np.take_along_axis(sent, index, axis=1), np.uint8)
 
 

@@ -122,9 +122,9 @@ def loss_of(network: StripNetwork, sample: Sample, columns: NDArray[np.int64]) -
 
 def _by_burst(corrections: Tensor, sample: Sample) -> Tensor:
     """(bursts, B, packet) corrections (B, N) added over the copies of each burst."""
-    first, length, n_copies = int(sample.first_slot), int(sample.packet_slots), sample.burst.size
-    inside = corrections[:, : n_copies * length - first]
-    padded = torch.nn.functional.pad(inside, (first, n_copies * length - first - inside.shape[1]))
+    start, length, n_copies = int(sample.first_slot), int(sample.packet_slots), sample.burst.size
+    inside = corrections[:, : n_copies * length - start]
+    padded = torch.nn.functional.pad(inside, (start, n_copies * length - start - inside.shape[1]))
     copies = padded.reshape(len(corrections), n_copies, length)
     n_bursts = int(sample.burst.max()) + 1
     return torch.stack([copies[:, torch.from_numpy(sample.burst == burst)].sum(dim=1) for burst in range(n_bursts)])

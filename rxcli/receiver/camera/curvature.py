@@ -39,7 +39,7 @@ def likeliest_bend(strips: ColumnStrips, level: Float32Array) -> FloatArray:
     level = np.ascontiguousarray(level[::strips_per_column])
     moved = _moved_rows(strips, strips_per_column, UNIT_BEND)
     bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, 16)
-    straight = (_moved(level, np.float32(bend) * moved) for bend in bends)
+    straight = (_moved(level, np.float32(size) * moved) for size in bends)
     return np.asarray(bends[np.argmax([(light[:-1] * light[1:]).sum() for light in straight])] * UNIT_BEND)
 
 

@@ -80,9 +80,9 @@ def settle(
     return found, moved
 
 
-def _turned(bend: FloatArray, hypothesis: CameraHypothesis) -> FloatArray:
+def _turned(curvature: FloatArray, hypothesis: CameraHypothesis) -> FloatArray:
     """A bend with rows in the order of readout for one with rows as stored, or the other way round."""
-    return bend * np.array([1.0, 1.0, -1.0, 1.0]) if hypothesis.reversed else bend
+    return curvature * np.array([1.0, 1.0, -1.0, 1.0]) if hypothesis.reversed else curvature
 
 
 def _chi_square(values: FloatArray, covariance: FloatArray) -> float:
@@ -179,8 +179,10 @@ class _Model:
         information = np.add.reduceat(near.weight * power * power, blocks, axis=1).astype(np.float64)
         pull = np.add.reduceat(near.weight * power * near.residual, blocks, axis=1).astype(np.float64)
         middle = np.minimum(blocks + _BLOCK_ROWS // 2, times.shape[1] - 1)
-        bend = (self._terms[:, :, :-1] + self._terms[:, :, 1:]) / 2
-        jacobian = np.concatenate([np.full((1, *pull.shape), -1.0), -times[None, :, middle], bend])[free] / values[1]
+        of_curvature = (self._terms[:, :, :-1] + self._terms[:, :, 1:]) / 2
+        jacobian = (
+            np.concatenate([np.full((1, *pull.shape), -1.0), -times[None, :, middle], of_curvature])[free] / values[1]
+        )
         flat = jacobian.reshape(free.size, -1)
         prior = np.zeros((values.size, values.size))
         prior[2:, 2:] = SETTINGS.samples_per_independent * _PRECISION
@@ -189,9 +191,9 @@ class _Model:
         step = np.zeros_like(values)
         step[free] = inverse @ (flat @ pull.ravel() - prior @ values[free])
         n_columns = self.strips.n_columns
-        spread = (jacobian * pull).reshape(free.size, n_columns, -1).sum(axis=2)
-        spread -= spread.mean(axis=1, keepdims=True)
+        by_column = (jacobian * pull).reshape(free.size, n_columns, -1).sum(axis=2)
+        by_column -= by_column.mean(axis=1, keepdims=True)
         scale = SETTINGS.sd_scale**2 * n_columns / max(n_columns - 1, 1)
         covariance = np.zeros((values.size, values.size))
-        covariance[np.ix_(free, free)] = scale * inverse @ (spread @ spread.T) @ inverse
+        covariance[np.ix_(free, free)] = scale * inverse @ (by_column @ by_column.T) @ inverse
         return step, covariance

@@ -72,7 +72,7 @@ def propose(
     level, weight = levelled(coarse.light, coarse.inside, window)
     level *= weight
     bends = [np.zeros(4)] + ([likeliest_bend(coarse, level)] if may_bend else [])
-    found = [clock for bend in bends for clock in _clocks(coarse, level, bend, width, exposures)]
+    found = [clock for curvature in bends for clock in _clocks(coarse, level, curvature, width, exposures)]
     is_short = exposure_s is not None and max(exposures.values()) <= LONG_EXPOSURE_SLOTS
     smeared = [] if is_short else _distinct(_smeared_clocks(strips, exposures, may_bend=may_bend))
     if smeared:  # Stripes as wide as those of the longest exposures are of no short one.
@@ -83,7 +83,7 @@ def propose(
 
 
 def propose_slots(strips: ColumnStrips, *, may_bend: bool = True) -> list[CameraHypothesis]:
-    """Cameras by the line of the slots alone, for a picture of less than a packet; the length of packets stays open.
+    """Cameras by the spectral line of the slot rate alone, for pictures of less than a packet; its length stays open.
 
     Args:
         strips: of the picture as it is stored.
@@ -97,7 +97,8 @@ def propose_slots(strips: ColumnStrips, *, may_bend: bool = True) -> list[Camera
     level *= weight
     n_bends = SETTINGS.n_line_bends if may_bend else 1
     bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, n_bends) if may_bend else np.zeros(1)
-    found = [_strongest_line(coarse, level, bend * UNIT_BEND, width) for bend in bends.tolist()]
+    curvatures = bends[:, None] * UNIT_BEND
+    found = [_strongest_line(coarse, level, curvature, width) for curvature in curvatures]
     best = max(range(n_bends), key=lambda number: found[number][1])
     if found[best][1] < SETTINGS.min_slot_line:
         return []
@@ -106,22 +107,24 @@ def propose_slots(strips: ColumnStrips, *, may_bend: bool = True) -> list[Camera
             rows_per_slot=rows,
             packet_slots=0,
             reversed=is_reversed,
-            curvature=bend * UNIT_BEND,
+            curvature=curvatures[place],
             exposure_slots=min(exposure_of(width / rows, rows), LONG_EXPOSURE_SLOTS),
             score=strength,
             rows_per_slot_sd=rows * rows / (4 * level.shape[1] * coarse.pitch),
-            curvature_sd=np.abs(bend * UNIT_BEND) / 4,
+            curvature_sd=np.abs(curvatures[place]) / 4,
             number=number,
         )
         for number, place in enumerate(dict.fromkeys((best, n_bends // 2)))
-        for bend, (rows, strength) in ((bends[place], found[place]),)
+        for rows, strength in (found[place],)
         for is_reversed in (False, True)
     ]
 
 
-def _strongest_line(strips: ColumnStrips, level: Float32Array, bend: FloatArray, width: float) -> tuple[float, float]:
+def _strongest_line(
+    strips: ColumnStrips, level: Float32Array, curvature: FloatArray, width: float
+) -> tuple[float, float]:
     """Rows a slot of the strongest line of the slots on stripes of one bend, and its strength."""
-    columns = columns_of(straightened(strips, level, bend), strips.n_columns)
+    columns = columns_of(straightened(strips, level, curvature), strips.n_columns)
     line, n_rows = _slot_line(columns), columns.shape[1]
     low, high = _line_places(width, strips.pitch, n_rows)
     (place,) = low + _peaks(line[low : high + 2], 1, 1) if high > low + 2 else (0.0,)
@@ -188,10 +191,10 @@ def _is_same(candidate: CameraHypothesis, better: CameraHypothesis) -> bool:
 
 
 def _clocks(
-    strips: ColumnStrips, level: Float32Array, bend: FloatArray, width: float, exposures: dict[int, float]
+    strips: ColumnStrips, level: Float32Array, curvature: FloatArray, width: float, exposures: dict[int, float]
 ) -> Iterator[CameraHypothesis]:
     """Clocks that stand out on stripes of one bend, in any order."""
-    straight = straightened(strips, level, bend)
+    straight = straightened(strips, level, curvature)
     columns = columns_of(straight, strips.n_columns)
     n_rows, pitch = columns.shape[1], strips.pitch
     correlation = _autocorrelation(columns)
@@ -208,8 +211,8 @@ def _clocks(
     copies = _surprise(correlation, round(2 * SLOTS_PER_SYMBOL * shortest))
     total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
     for length, exposure in exposures.items():
-        first, last = (int(rows * length) for rows in (shortest, longest))
-        lags = first + _peaks(copies[first : last + 1], SETTINGS.n_peaks, max(round(2 * shortest), 1))
+        low, high = (int(rows * length) for rows in (shortest, longest))
+        lags = low + _peaks(copies[low : high + 1], SETTINGS.n_peaks, max(round(2 * shortest), 1))
         for rows in np.concatenate([lines, lags / length]).tolist():
             # Of the shortest packets a picture may show less than a payload, but more than a preamble.
             least = length - PREAMBLE_SLOTS
@@ -219,7 +222,7 @@ def _clocks(
             strength = float(np.interp(harmonics * n_rows / rows, np.arange(line.size), line).max())
             found = min(exposure_of(half_width / rows, rows * pitch), LONG_EXPOSURE_SLOTS)
             clock = _Clock(rows, length, strength, exposure, found)
-            yield from _both_ways(clock, copies, total, bend, pitch)
+            yield from _both_ways(clock, copies, total, curvature, pitch)
 
 
 def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_bend: bool) -> Iterator[CameraHypothesis]:
@@ -234,14 +237,14 @@ def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_be
     for rows, strength, found, change in _long_exposures(strips, is_stated=any(exposures.values())):
         # The changes of the clearest line show the bend of all.
         bends = bends or [np.zeros(4)] + ([likeliest_bend(strips, change)] if may_bend else [])
-        for bend in bends:
-            columns = columns_of(straightened(strips, change, bend), strips.n_columns)
+        for curvature in bends:
+            columns = columns_of(straightened(strips, change, curvature), strips.n_columns)
             copies = _surprise(_autocorrelation(columns), round(2 * SLOTS_PER_SYMBOL * rows))
             total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
             for length, exposure in exposures.items():
                 if rows * (length - PREAMBLE_SLOTS) <= columns.shape[1]:
                     clock = _Clock(rows, length, strength, exposure, found)
-                    yield from _both_ways(clock, copies, total, bend, strips.pitch)
+                    yield from _both_ways(clock, copies, total, curvature, strips.pitch)
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,7 +261,7 @@ class _Clock:
 
 
 def _both_ways(
-    clock: _Clock, copies: FloatArray, total: FloatArray, bend: FloatArray, pitch: float
+    clock: _Clock, copies: FloatArray, total: FloatArray, curvature: FloatArray, pitch: float
 ) -> Iterator[CameraHypothesis]:
     """Cameras with a clock, as the rows stand and read backwards.
 
@@ -266,7 +269,7 @@ def _both_ways(
         clock: the clock.
         copies: (R,) excess of the columns' autocorrelation.
         total: (R + 1,) running sum of the columns' mean.
-        bend: (4,) of the stripes.
+        curvature: (4,) of the stripes.
         pitch: picture rows of a row.
     """
     rows, length = clock.rows, clock.length
@@ -278,12 +281,12 @@ def _both_ways(
             rows_per_slot=rows * pitch,
             packet_slots=length,
             reversed=bool(is_reversed),
-            curvature=bend,
+            curvature=curvature,
             exposure_slots=clock.stated or clock.found,
             score=max(header, 0.0) ** 2 + common,
             # A period that is off by a part of a slot over the picture shows as well.
             rows_per_slot_sd=rows * rows * pitch * off_slots / copies.size,
-            curvature_sd=np.abs(bend) / 4,
+            curvature_sd=np.abs(curvature) / 4,
             stated_exposure_slots=clock.stated,
         )
 
@@ -307,7 +310,7 @@ def _long_exposures(strips: ColumnStrips, *, is_stated: bool) -> Iterator[tuple[
 
 
 def _is_among(rows: float, lines: list[tuple[float, float]]) -> bool:
-    return any(abs(np.log(rows / other)) < SETTINGS.same_clock for other, _ in lines)
+    return any(abs(np.log(rows / known)) < SETTINGS.same_clock for known, _ in lines)
 
 
 def exposure_by_changes(columns: Float32Array, rows_per_slot: float) -> float:
@@ -321,9 +324,9 @@ def exposure_by_changes(columns: Float32Array, rows_per_slot: float) -> float:
     overlap = np.arange(columns.shape[1], 0, -1)
     own = _autocorrelation(_own_light(columns)) / overlap
     likeness = np.interp(lags * rows_per_slot, np.arange(overlap.size), own)
-    alike = shapes @ likeness
-    best = int(np.clip(alike.argmax(), 1, alike.size - 2))
-    offset = np.clip(peak_offset(*alike[best - 1 : best + 2]), -0.5, 0.5)
+    similarity = shapes @ likeness
+    best = int(np.clip(similarity.argmax(), 1, similarity.size - 2))
+    offset = np.clip(peak_offset(*similarity[best - 1 : best + 2]), -0.5, 0.5)
     return float(exposures[best] + SETTINGS.exposure_step * offset)
 
 
@@ -333,9 +336,9 @@ def _likeness_of_changes() -> tuple[FloatArray, FloatArray, FloatArray]:
     step, reach = 1 / _SAMPLES, 3 * SLOTS_PER_SYMBOL
     every = np.arange(-reach, reach + step / 2, step)
     # Slots of a word have a fixed sum.
-    apart = np.abs(np.arange(-reach, reach + 1))
-    alike = np.where(apart == 0, 1.0, -np.maximum(1 - apart / SLOTS_PER_SYMBOL, 0) / (SLOTS_PER_SYMBOL - 1))
-    slots = np.convolve(np.interp(every, np.arange(-reach, reach + 1), alike), _TRIANGLE, "same")
+    distance = np.abs(np.arange(-reach, reach + 1))
+    expected = np.where(distance == 0, 1.0, -np.maximum(1 - distance / SLOTS_PER_SYMBOL, 0) / (SLOTS_PER_SYMBOL - 1))
+    slots = np.convolve(np.interp(every, np.arange(-reach, reach + 1), expected), _TRIANGLE, "same")
     exposures = np.arange(SETTINGS.min_exposure_slots, MAX_EXPOSURE_SLOTS, SETTINGS.exposure_step)
     lags = np.arange(0, MAX_EXPOSURE_SLOTS + 1.5, step)
     shapes = [
@@ -361,19 +364,19 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
         if light.shape[1] < 2 * furthest:
             continue
         smooth = _blurred(light, max(lag // 2, 1))
-        bend = smooth[:, 2 * lag :] - 2 * smooth[:, lag:-lag] + smooth[:, : -2 * lag]
-        bend /= np.median(np.abs(bend), axis=1, keepdims=True) + np.float32(TINY)
+        turn = smooth[:, 2 * lag :] - 2 * smooth[:, lag:-lag] + smooth[:, : -2 * lag]
+        turn /= np.median(np.abs(turn), axis=1, keepdims=True) + np.float32(TINY)
         most = np.float32(SETTINGS.max_bend_ratio)
-        bend = np.clip(bend, -most, most)
-        n = bend.shape[1]
-        columns, bends = (part.reshape(strips.n_columns, -1, n).mean(axis=1) for part in (bend, np.abs(bend)))
+        turn = np.clip(turn, -most, most)
+        n = turn.shape[1]
+        columns, turns = (part.reshape(strips.n_columns, -1, n).mean(axis=1) for part in (turn, np.abs(turn)))
         columns = _own_light(columns)
         likeness = _autocorrelation(columns)[nearest:furthest] / np.arange(n, 0, -1)[nearest:furthest]
         exposure = nearest + int(likeness.argmin())
         product = np.zeros_like(columns)
         product[:, exposure:] = -columns[:, :-exposure] * columns[:, exposure:]
         # Together, and each column by itself, since the stripes of corrected pictures are bent.
-        parts = product.sum(axis=0, keepdims=True), product, bends
+        parts = product.sum(axis=0, keepdims=True), product, turns
         size = cv2.getOptimalDFTSize(_FINE * n)
         spectrum = np.asarray(sum(_line_spectrum(part, lag, size) for part in parts))
         frequency = np.arange(spectrum.size) / size
@@ -436,8 +439,8 @@ def _autocorrelation(columns: Float32Array, later: Float32Array | None = None) -
     n = columns.shape[1]
     size = cv2.getOptimalDFTSize(2 * n)
     spectrum = np.fft.rfft(columns, size, axis=1)
-    others = spectrum if later is None else np.fft.rfft(later, size, axis=1)
-    return np.asarray(np.fft.irfft((spectrum * others.conj()).real.sum(axis=0), size)[:n])
+    beside = spectrum if later is None else np.fft.rfft(later, size, axis=1)
+    return np.asarray(np.fft.irfft((spectrum * beside.conj()).real.sum(axis=0), size)[:n])
 
 
 def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:
@@ -453,9 +456,10 @@ def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:
 
 
 def _slot_line(columns: Float32Array) -> FloatArray:
-    """Spectrum of the edges' power, log-likelihood ratio over chance, by cycles over the picture times _FINE."""
+    """Log-likelihood ratio of a line in the spectrum of the edges' power, by cycles over the picture times _FINE."""
     steps = np.diff(columns, axis=1)
     square = np.asarray(steps * steps, np.float32)
+    # The level's window is ten symbols at one row a slot, one at ten.
     power = (square - local_mean(square, 10 * SLOTS_PER_SYMBOL)).sum(axis=0, dtype=np.float64)
     spectrum = np.abs(np.fft.rfft(power, _FINE * columns.shape[1])) ** 2
     return np.asarray(spectrum / max(float(power @ power), TINY))
@@ -466,7 +470,7 @@ def _peaks(values: FloatArray, n: int, distance: int) -> FloatArray:
     inner = np.flatnonzero((values[1:-1] > values[:-2]) & (values[1:-1] >= values[2:])) + 1
     chosen: list[int] = []
     for at in inner[np.argsort(-values[inner])].tolist():
-        if len(chosen) < n and all(abs(at - other) >= distance for other in chosen):
+        if len(chosen) < n and all(abs(at - higher) >= distance for higher in chosen):
             chosen.append(at)
     at = np.array(chosen, np.int64)
     return np.asarray(at + peak_offset(values[at - 1], values[at], values[at + 1]))
@@ -485,8 +489,8 @@ def _header_peaks(total: FloatArray, rows_per_slot: float, packet_slots: int) ->
     response = header_correlation(np.interp(places, np.arange(total.size), total), _SAMPLES) / step
     if response.size == 0:
         return 0.0, 0.0
-    spread = float(np.median(np.abs(response))) / NORMAL_MEDIAN + TINY
+    deviation = float(np.median(np.abs(response))) / NORMAL_MEDIAN + TINY
     period = packet_slots * _SAMPLES
     n_copies = folded(np.ones(response.size), period)
-    score = folded(response, period) / np.sqrt(np.maximum(n_copies, 1)) / spread
+    score = folded(response, period) / np.sqrt(np.maximum(n_copies, 1)) / deviation
     return float(score.max()), float(-score.min())

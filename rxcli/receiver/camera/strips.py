@@ -96,7 +96,7 @@ def levelled(light: Float32Array, inside: Float32Array, window: int) -> tuple[Fl
     share = np.maximum(cv2.blur(inside, size), np.float32(1 / size[0]))
     change = (light - cv2.blur(light, size) / share) * inside
     beside = np.pad(change, ((1, 1), (0, 0)), mode="reflect")
-    power, left, right = (cv2.blur(change * other, size) / share for other in (change, beside[:-2], beside[2:]))
+    power, left, right = (cv2.blur(change * factor, size) / share for factor in (change, beside[:-2], beside[2:]))
     signal = np.clip(np.maximum(left, right), 0, power)
     sigmas = np.float32(SETTINGS.bounded_sigmas)
     doubt = signal + sigmas * sigmas * (power - signal) + np.float32(SETTINGS.min_variance)

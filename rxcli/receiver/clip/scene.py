@@ -312,7 +312,7 @@ class TrackedScreen:
         return self._picture.learn(observation, forget=forget)
 
     def can_measure_again(self, view: View) -> bool:
-        """Whether a frame's strips are those of this screen."""
+        """Whether a frame can be measured with this picture: its strips are those of the first frame."""
         return view.light is not None and view.pose is not None and view.pose.home is self._first_pose.map
 
     def measure_again(self, views: Sequence[View], known: Sequence[Float32Array], doubtful: Sequence[bool]) -> None:

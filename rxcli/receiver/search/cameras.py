@@ -91,7 +91,7 @@ def propose_cameras(
 def cameras_by_slots(
     context: FrameContext, screens: Sequence[ScreenProfile]
 ) -> Iterator[tuple[ScreenProfile, FrameCamera]]:
-    """Cameras by the line of the slots alone, with each screen whose exposure in slots the stripes may show.
+    """Cameras by the spectral line of the slot rate alone, each with the screens whose exposure the stripes may show.
 
     Args:
         context: the frame.
