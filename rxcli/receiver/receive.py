@@ -181,8 +181,9 @@ def _with_cut_packets(cache: FrameCache, received: Received, options: ReceiverOp
     screens = proposed_screens(cache, options)
     if isinstance(screens, Failure):
         return own
-    corners = screens[0][0].corners if result.corners is None else result.corners
-    cut = cut_packets(FrameContext(cache, corners, known or UNKNOWN, _of_columns(result, options)))
+    camera, own_screens = known or UNKNOWN, _of_columns(result, options)
+    families = {outline.family: outline for outline in reversed(screens[0])}.values()
+    cut = cut_packets([FrameContext(cache, outline.corners, camera, own_screens) for outline in families])
     likeliest, *less_likely = (*cut, *([own] if own else ())) or (None,)
     return None if likeliest is None else replace(likeliest, alternatives=tuple(less_likely))
 

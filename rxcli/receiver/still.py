@@ -1,6 +1,6 @@
 """Reception of a still from its clock: light model and detection in turn. Part of the wiring."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -145,6 +145,25 @@ def initial_pass(acquisition: Acquisition, room_light: float = 1.0) -> Reception
 def detected_on(reception: Reception, clock: Clock) -> Reception:
     """The initial pass with its slots at other places in their packets."""
     return replace(reception, clock=clock, posteriors=detected(reception.metrics, clock))
+
+
+def slots_of_any_kind(acquisition: Acquisition, clocks: Sequence[Clock]) -> list[tuple[Float32Array, float]]:
+    """Slots and picture on clocks of one shape, whatever the slots send, whose payload is all that is in view.
+
+    Returns:
+        For each clock, the probability that its slots are lit (C, slots of a packet), and the log evidence.
+    """
+    profiles, columns = acquisition.binned, np.arange(len(acquisition.profiles.light))
+    parts = []
+    for clock in clocks:
+        samples = sync.sample_slots(profiles, clock, STILL.coarse_samples)
+        model = _light_model(replace(acquisition, profiles=profiles), clock, samples)
+        by_start = sync.sample_slots(profiles, ratios.by_start(clock), STILL.coarse_samples)
+        level, noise, crosstalk = model.black_level, model.noise, model.crosstalk
+        parts.append(ratios.burst_samples(by_start, clock, level, noise, crosstalk, columns))
+    lit, evidence = survivors.detect_free(survivors.side_by_side(parts), QUICK_SURVIVORS)
+    by_clock = evidence.reshape(len(clocks), -1).sum(axis=1).tolist()
+    return list(zip(lit.reshape(len(clocks), columns.size, -1), by_clock, strict=True))
 
 
 def _joint_initial_pass(acquisition: Acquisition) -> Reception:

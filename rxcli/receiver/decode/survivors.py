@@ -129,6 +129,17 @@ def free_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIV
     return np.asarray(log_evidence.reshape(samples.n_bursts, samples.n_columns).sum(axis=0))
 
 
+def detect_free(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> tuple[Float32Array, FloatArray]:
+    """(lanes, slots) probability that arbitrary slots are lit, one half before the payload; (lanes,) log evidence."""
+    paths, steps, ends = _forward(samples, settings, is_free=True)
+    lit = np.full((len(paths.w), samples.light.shape[0]), 0.5, np.float32)
+    words = _backward(steps, ends, np.zeros_like(paths.log_likelihood))
+    for (n, _), (posterior, _, word) in zip(ends, words, strict=True):
+        slots = (word[..., None] >> np.arange(SLOTS_PER_SYMBOL - 1, -1, -1)) & 1
+        lit[:, n + 1 - SLOTS_PER_SYMBOL : n + 1] = (posterior[..., None] * slots).sum(axis=1)
+    return lit, _log_evidence(paths, samples, settings)
+
+
 def _log_evidence(paths: _Paths, samples: BurstSamples, settings: SurvivorSettings) -> FloatArray:
     """(lanes,) log evidence of the last paths together."""
     return np.asarray(np.logaddexp.reduce(paths.log_likelihood, axis=1) + samples.log_scale * settings.information)

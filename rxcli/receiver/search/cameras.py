@@ -26,7 +26,7 @@ from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.types import FloatArray, Frame, Lens, RowProfiles
+from rxcli.types import Clock, Float32Array, FloatArray, Frame, Lens, RowProfiles
 
 DEFAULT_TONE = "srgb"
 UNKNOWN = FrameCamera(None, float("nan"), float("nan"), None, DEFAULT_TONE)
@@ -93,6 +93,8 @@ def cameras_by_slots(
 ) -> Iterator[tuple[ScreenProfile, FrameCamera]]:
     """Cameras by the spectral line of the slot rate alone, each with the screens whose exposure the stripes may show.
 
+    The screen whose exposure is the likeliest comes first.
+
     Args:
         context: the frame.
         screens: that it may show.
@@ -108,7 +110,8 @@ def cameras_by_slots(
             own = [(s, relabelled_camera(camera, s, frame)) for s in screens if s.columns == n_columns]
             off = [abs(np.log(c.exposure_s * s.slot_rate_hz / hypothesis.exposure_slots)) for s, c in own]
             near = max(min(off), SETTINGS.near_exposures)
-            yield from (pair for pair, distance in zip(own, off, strict=True) if distance <= near)
+            ranked = sorted(zip(off, range(len(own)), strict=True))
+            yield from (own[number] for distance, number in ranked if distance <= near)
 
 
 def estimated_camera(hypothesis: CameraHypothesis, slot_rate_hz: float, frame: Frame) -> FrameCamera:
@@ -141,16 +144,23 @@ def settle(
     context: FrameContext, acquisition: Acquisition, reception: Reception, *, may_bend: bool = True
 ) -> tuple[FrameCamera, float]:
     """Fit an estimated camera to decoded slots; also return the largest shift of the clock, slots."""
+    lit = reception.clock.on_grid(reception.posteriors.lit)
+    return settle_slots(context, acquisition, reception.clock, lit, may_bend=may_bend)
+
+
+def settle_slots(
+    context: FrameContext, acquisition: Acquisition, clock: Clock, lit: Float32Array, *, may_bend: bool = True
+) -> tuple[FrameCamera, float]:
+    """`settle` on the probabilities (C, N) that the slots of a clock are lit."""
     camera, screen, frame = context.camera, acquisition.screen, context.frame
     if camera.hypothesis is None:
         return camera, 0.0
     with context.timer("blind"):
-        clock = reception.clock
         found, moved_slots = settle_hypothesis(
             _strips(context, acquisition.profiles),
             camera.hypothesis,
             clock,
-            clock.on_grid(reception.posteriors.lit),
+            lit,
             screen.light_spread,
             may_bend=may_bend and frame.mosaic is None,
         )

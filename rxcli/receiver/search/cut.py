@@ -1,178 +1,219 @@
-"""Less than a packet in view: soft bits for each camera, screen, clock and start that the picture leaves open."""
+"""Less than a packet in view: soft bits for each screen, direction and start that the picture leaves open."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rxcli.numerics import peak_offset
+from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver import channel
 from rxcli.receiver.camera.settings import SETTINGS as CAMERA
 from rxcli.receiver.decode import detect
-from rxcli.receiver.frame.acquisition import Acquisition, distinct_screens, noise_of
+from rxcli.receiver.frame.acquisition import Acquisition, distinct_screens
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception, dark_columns, soft_bits
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.search import evidence
-from rxcli.receiver.search.cameras import cameras_by_slots, settle
+from rxcli.receiver.search.cameras import cameras_by_slots, estimated_camera, relabelled_camera, settle_slots
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.receiver.still import decode, detected_on, initial_pass
+from rxcli.receiver.still import decode, detected_on, initial_pass, slots_of_any_kind
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import Clock, FrameSoftBits
+from rxcli.types import Clock, Float32Array, FrameSoftBits
 
 #: Passes made over cut packets: all columns with light.
 _SKIP = frozenset({"dark_columns"})
 
 
 @dataclass(frozen=True, slots=True)
+class _Slots:
+    """The slots of a picture by one camera, whatever they send."""
+
+    context: FrameContext
+    #: On the clock of a long packet whose payload is all that is in view.
+    acquisition: Acquisition
+    #: (C, N) probability that each slot is lit; and log evidence of them with the picture, on average.
+    lit: Float32Array
+    evidence: float
+    #: Screens that may send them.
+    screens: Sequence[ScreenProfile]
+
+
+@dataclass(frozen=True, slots=True)
 class _Candidate:
-    """A clock of one camera and screen."""
+    """A start of the packets of one screen."""
 
     context: FrameContext
     acquisition: Acquisition
-    #: Of its middle columns; less that of most clocks of the same camera and screen.
-    evidence: float
-    lead: float = 0.0
+    #: See `evidence.fit`, of the middle columns; a header in view has to earn its place.
+    fit: float
+    is_open: bool
 
     def is_near(self, better: _Candidate) -> bool:
         """Whether its symbols begin where those of a better one do, by the same screen read the same way."""
-        if self.acquisition.screen != better.acquisition.screen or self.is_reversed != better.is_reversed:
-            return False
-        ahead = (self._symbol_phase - better._symbol_phase) % SLOTS_PER_SYMBOL
-        return min(ahead, SLOTS_PER_SYMBOL - ahead) < SETTINGS.same_symbols_slots
-
-    @property
-    def is_reversed(self) -> bool:
-        """Whether rows run against the readout."""
-        return self.context.camera.reversed
-
-    @property
-    def _symbol_phase(self) -> float:
-        """Slots from the beginning of a symbol to the middle row."""
-        clock, (top, bottom) = self.acquisition.clock, sync.row_span(self.acquisition.profiles)
-        return ((top + bottom) / 2 - clock.row0) / clock.rows_per_slot + clock.first_slot
+        own, known = self.acquisition, better.acquisition
+        is_same = own.screen == known.screen and self.context.camera.reversed == better.context.camera.reversed
+        return is_same and (own.clock.first_slot - known.clock.first_slot) % SLOTS_PER_SYMBOL == 0
 
 
-def cut_packets(context: FrameContext) -> tuple[FrameSoftBits, ...]:
+def cut_packets(contexts: Sequence[FrameContext]) -> tuple[FrameSoftBits, ...]:
     """Soft bits of a frame that shows less than a packet, likeliest first.
 
     Args:
-        context: the frame with its screens; its camera, or an unknown one.
+        contexts: the frame by every outline, with its screens; its camera, or an unknown one.
     """
-    with context.timer("detect"):
-        candidates = _distinct(c for possible in _contexts(context) for c in _candidates(possible))
-        if context.camera.profile is None:
-            # Words of weight 5 are as likely read backwards.
-            best_of_each_way = {c.is_reversed: c for c in reversed(candidates)}.values()
-            candidates = _distinct((*(c for best in best_of_each_way for c in _fitted(best)), *candidates))
-        return tuple(_soft_bits(candidate) for candidate in candidates)
+    with contexts[0].timer("detect"):
+        best = max(_ways_to_read(contexts), key=lambda slots: slots.evidence, default=None)
+        if best is None:
+            return ()
+        directions = (best,) if best.context.camera.hypothesis is None else (best, _backwards(best))
+        candidates = (candidate for slots in directions for candidate in _candidates(slots))
+        return tuple(_soft_bits(candidate) for candidate in _distinct(candidates))
 
 
-def _contexts(context: FrameContext) -> Iterator[FrameContext]:
-    """The frame by each camera and screen that it may show."""
+def _ways_to_read(contexts: Sequence[FrameContext]) -> Iterator[_Slots]:
+    """The slots of a frame by each outline and camera."""
+    for context in contexts:
+        for by_camera in _cameras(context):
+            yield from (_settled(slots) for slots in _slots_by(by_camera))
+
+
+def _cameras(context: FrameContext) -> Iterable[FrameContext]:
+    """The frame by each camera, with the screens that it may have seen."""
     screens = distinct_screens(context.screens)
     if context.camera.profile is not None:
-        yield from (replace(context, screens=(screen,)) for screen in screens)
-        return
+        rates = dict.fromkeys(screen.slot_rate_hz for screen in screens)
+        return [replace(context, screens=tuple(s for s in screens if s.slot_rate_hz == rate)) for rate in rates]
+    ways: dict[int, FrameContext] = {}
     for screen, camera in cameras_by_slots(context, screens):
-        yield replace(context, camera=camera, screens=(screen,))
+        # The light of slots looks the same backwards.
+        if camera.hypothesis is not None and not camera.reversed:
+            way = ways.get(camera.hypothesis.number, replace(context, camera=camera, screens=()))
+            ways[camera.hypothesis.number] = replace(way, screens=(*way.screens, screen))
+    return ways.values()
+
+
+def _slots_by(context: FrameContext) -> Iterator[_Slots]:
+    """The slots by the first screen of a context, at their likeliest phase; none where they are too few."""
+    screen, camera = context.screens[0], context.camera
+    profiles = context.sample_columns(screen.columns)
+    rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
+    exposure_slots = camera.exposure_s * screen.slot_rate_hz
+    top, bottom = sync.row_span(profiles)
+    n_slots = int(np.ceil((bottom - top) / rows_per_slot)) + 1
+    if n_slots <= SETTINGS.cut_symbols * SLOTS_PER_SYMBOL or exposure_slots > LONG_EXPOSURE_SLOTS:
+        return
+    clock = Clock(
+        rows_per_slot=rows_per_slot,
+        exposure_slots=exposure_slots,
+        packet_slots=PREAMBLE_SLOTS + -(-n_slots // SLOTS_PER_SYMBOL) * SLOTS_PER_SYMBOL,
+        row0=top,
+        n_slots=n_slots,
+        first_slot=PREAMBLE_SLOTS,
+        burst=np.zeros(1, np.int64),
+        delay_slots=np.zeros(screen.columns),
+        header_peak_ratio=0.0,
+    )
+    n, step = SETTINGS.cut_phases, rows_per_slot / SETTINGS.cut_phases
+    acquisition = Acquisition(screen, profiles, clock, (screen,))
+    clocks = [replace(clock, row0=top - part * step) for part in range(n)]
+    found = slots_of_any_kind(acquisition, clocks)
+    best = max(range(n), key=lambda part: found[part][1])
+    lit, log_evidence = found[best]
+    beside = peak_offset(*np.array([found[(best + side) % n][1] for side in (-1, 0, 1)]))
+    clock = replace(clocks[best], row0=clocks[best].row0 - float(np.clip(beside, -0.5, 0.5)) * step)
+    each = log_evidence * rows_per_slot / (bottom - top)
+    yield _Slots(context, replace(acquisition, clock=clock), clock.on_grid(lit[None]), each, context.screens)
+
+
+def _settled(slots: _Slots) -> _Slots:
+    """The slots by their camera fitted to them."""
+    for _ in range(CAMERA.max_fits if slots.context.camera.hypothesis else 0):
+        camera, moved_slots = settle_slots(slots.context, slots.acquisition, slots.acquisition.clock, slots.lit)
+        better = next(_slots_by(replace(slots.context, camera=camera)), slots)
+        if better.evidence <= slots.evidence:
+            break
+        slots = better
+        if moved_slots < CAMERA.matters_slots:
+            break
+    return slots
+
+
+def _backwards(slots: _Slots) -> _Slots:
+    """The slots of a picture whose rows run against the readout."""
+    context, screen, clock = slots.context, slots.acquisition.screen, slots.acquisition.clock
+    assert context.camera.hypothesis is not None
+    hypothesis = replace(context.camera.hypothesis, reversed=True)
+    context = replace(context, camera=estimated_camera(hypothesis, screen.slot_rate_hz, context.frame))
+    row0 = context.frame.height - 1 - clock.row0 - clock.n_slots * clock.rows_per_slot
+    acquisition = replace(
+        slots.acquisition, profiles=context.sample_columns(screen.columns), clock=replace(clock, row0=row0)
+    )
+    return replace(slots, context=context, acquisition=acquisition, lit=slots.lit[:, ::-1])
+
+
+def _candidates(slots: _Slots) -> Iterator[_Candidate]:
+    """Starts of packets: at every phase of a symbol, and at the likeliest ones with a header in view."""
+    clock = slots.acquisition.clock
+    for screen in slots.screens:
+        camera, n = relabelled_camera(slots.context.camera, screen, slots.context.frame), screen.packet_slots
+        context = replace(slots.context, camera=camera, screens=(screen,))
+        clock = replace(clock, exposure_slots=camera.exposure_s * screen.slot_rate_hz)
+        acquisition = replace(slots.acquisition, screen=screen, variants=(screen,), clock=clock)
+        initial = initial_pass(acquisition.of_columns(acquisition.middle_columns))
+
+        # Packets of any length: longer by a symbol than what is in view, as the first one may begin before the picture.
+        longer = clock.packet_slots + SLOTS_PER_SYMBOL
+        without = {phase: _fit(initial, PREAMBLE_SLOTS + phase, longer) for phase in range(SLOTS_PER_SYMBOL)}
+        starts: dict[int, tuple[float, bool]] = {}
+        for phase in sorted(without, key=lambda phase: -without[phase])[: SETTINGS.cut_symbol_phases]:
+            for first_slot in range(phase, n, SLOTS_PER_SYMBOL):
+                # The last slot of the clock lies beyond the picture.
+                if first_slot < PREAMBLE_SLOTS or first_slot + clock.n_slots > n + 1:
+                    starts[first_slot] = _fit(initial, first_slot, n) - SETTINGS.cut_start, False
+            if PREAMBLE_SLOTS + phase + clock.n_slots <= n + 1:
+                starts[PREAMBLE_SLOTS + phase] = without[phase], True
+        for first_slot, (fit, is_open) in starts.items():
+            yield _Candidate(context, replace(acquisition, clock=_started(clock, first_slot, n)), fit, is_open)
+
+
+def _fit(initial: Reception, first_slot: int, packet_slots: int) -> float:
+    """`evidence.fit` of packets of some length that begin elsewhere."""
+    return evidence.fit(detected_on(initial, _started(initial.clock, first_slot, packet_slots)))
+
+
+def _started(clock: Clock, first_slot: int, packet_slots: int) -> Clock:
+    """The clock with packets of some length that begin elsewhere, every copy in a burst of its own."""
+    n_copies = -(-(first_slot + clock.n_slots) // packet_slots)
+    return replace(clock, packet_slots=packet_slots, first_slot=first_slot, burst=np.arange(n_copies))
 
 
 def _distinct(candidates: Iterable[_Candidate]) -> list[_Candidate]:
     """The likeliest few whose symbols begin at different places."""
     out: list[_Candidate] = []
-    for candidate in sorted(candidates, key=lambda candidate: -candidate.lead):
+    for candidate in sorted(candidates, key=lambda candidate: -candidate.fit):
         if len(out) < SETTINGS.max_cut and not any(candidate.is_near(better) for better in out):
             out.append(candidate)
     return out
 
 
-def _fitted(best: _Candidate) -> list[_Candidate]:
-    """Candidates of the best camera, fitted to the slots that were decided with it."""
-    found: list[_Candidate] = []
-    for _ in range(CAMERA.max_fits):
-        initial = initial_pass(best.acquisition)
-        camera, moved_slots = settle(best.context, best.acquisition, initial)
-        refined = _candidates(replace(best.context, camera=camera))
-        likeliest = max(refined, key=lambda candidate: candidate.lead, default=best)
-        if likeliest.lead <= best.lead:
-            break
-        found, best = refined, likeliest
-        if moved_slots < CAMERA.matters_slots:
-            break
-    return found
-
-
-def _candidates(context: FrameContext) -> list[_Candidate]:
-    """Clocks of one camera and screen, with their lead over most of them."""
-    found = list(_clocks(context))
-    usual = float(np.median([candidate.evidence for candidate in found])) if found else 0.0
-    return [replace(candidate, lead=candidate.evidence - usual) for candidate in found]
-
-
-def _clocks(context: FrameContext) -> Iterator[_Candidate]:
-    """Clocks with a header in view, and of every phase of slots and symbols without."""
-    (screen,) = context.screens
-    profiles = context.sample_columns(screen.columns)
-    rows_per_slot = 1 / (screen.slot_rate_hz * context.camera.line_delay_s)
-    exposure_slots = context.camera.exposure_s * screen.slot_rate_hz
-    top, bottom = sync.row_span(profiles)
-    n_visible = (bottom - top) / rows_per_slot
-    if n_visible < SETTINGS.cut_symbols * SLOTS_PER_SYMBOL or exposure_slots > LONG_EXPOSURE_SLOTS:
-        return
-
-    def candidate(clock: Clock, of_middle: Reception) -> _Candidate:
-        acquisition = Acquisition(screen, profiles, clock, (screen,))
-        return _Candidate(context, acquisition, evidence.log_evidence(of_middle))
-
-    def middle_pass(clock: Clock) -> Reception:
-        acquisition = Acquisition(screen, profiles, clock, (screen,))
-        return initial_pass(acquisition.of_columns(acquisition.middle_columns))
-
-    binned = sync.binned_strips(profiles)
-    clock = sync.find_clock(binned, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(binned))
-    if clock is not None and clock.header_peak_ratio > SETTINGS.min_lead:
-        yield candidate(clock, middle_pass(clock))
-    payload_slots = screen.packet_slots - PREAMBLE_SLOTS
-    for part in range(SETTINGS.cut_phases if n_visible < payload_slots else 0):
-        row0 = top - part / SETTINGS.cut_phases * rows_per_slot
-        n_shown = int(np.ceil((bottom - row0) / rows_per_slot))
-        clock = Clock(
-            rows_per_slot=rows_per_slot,
-            exposure_slots=exposure_slots,
-            packet_slots=screen.packet_slots,
-            row0=row0,
-            n_slots=min(n_shown, payload_slots - SLOTS_PER_SYMBOL + 1),
-            first_slot=PREAMBLE_SLOTS,
-            burst=np.zeros(1, np.int64),
-            delay_slots=np.zeros(screen.columns),
-            header_peak_ratio=0.0,
-        )
-        # The light of slots is the same wherever symbols begin.
-        initial = middle_pass(clock)
-        for phase in range(SLOTS_PER_SYMBOL):
-            first_slot = PREAMBLE_SLOTS + phase
-            n_slots = min(n_shown, payload_slots - phase)
-            shifted = detected_on(initial, replace(initial.clock, first_slot=first_slot))
-            yield candidate(replace(clock, n_slots=n_slots, first_slot=first_slot), shifted)
-
-
 def _soft_bits(candidate: _Candidate) -> FrameSoftBits:
-    """Soft bits of a cut packet, where its start is open unless header or dimming symbol show in part."""
-    acquisition, initial = max(_refined(candidate.acquisition), key=lambda found: evidence.log_evidence(found[1]))
-    best, is_open = initial, False
-    if initial.clock.header_peak_ratio == 0:
-        starts = [detected_on(initial, clock) for clock in _starts(initial.clock)]
-        likeliest = max(starts, key=evidence.log_evidence)
-        is_open = evidence.log_evidence(likeliest) < evidence.log_evidence(initial) + SETTINGS.cut_start
-        best = initial if is_open else likeliest
-    ways = [_of_common_weights(best)]
-    if is_open:
+    """Soft bits of a cut packet."""
+    acquisition = candidate.acquisition
+    initial = initial_pass(acquisition)
+    corrected = replace(acquisition, clock=replace(initial.clock, exposure_slots=acquisition.clock.exposure_slots))
+    acquisition, initial = max(
+        ((acquisition, initial), (corrected, initial_pass(corrected))), key=lambda found: evidence.fit(found[1])
+    )
+    ways = [_of_common_weights(initial)]
+    if candidate.is_open:
         ways += [_of_common_weights(initial_pass(acquisition, share)) for share in SETTINGS.cut_room_lights[1:]]
     reception = decode(acquisition, _SKIP, max(ways, key=_n_certain), keeps_weights=True)
-    return replace(soft_bits(candidate.context.frame, reception, dark_columns(reception.snr)), open_start=is_open)
+    found = soft_bits(candidate.context.frame, reception, dark_columns(reception.snr))
+    return replace(found, open_start=candidate.is_open)
 
 
 def _n_certain(initial: Reception) -> float:
@@ -186,25 +227,3 @@ def _of_common_weights(initial: Reception) -> Reception:
     bursts = channel.by_burst(initial.metrics, initial.clock)
     weights = detect.common_weights(detect.detect(bursts).w_log_prob)
     return replace(initial, posteriors=detect.detect(bursts, weights))
-
-
-def _refined(acquisition: Acquisition) -> Iterator[tuple[Acquisition, Reception]]:
-    """A clock, those a little earlier and later, and the best one corrected by its slots, with their initial passes."""
-    clock, found = acquisition.clock, list[tuple[Acquisition, Reception]]()
-    for part in (-0.5, 0.0, 0.5):
-        row0 = clock.row0 + part / SETTINGS.cut_phases * clock.rows_per_slot
-        moved = replace(acquisition, clock=replace(clock, row0=row0))
-        found.append((moved, initial_pass(moved)))
-    yield from found
-    _, best = max(found, key=lambda each: evidence.log_evidence(each[1]))
-    corrected = replace(acquisition, clock=replace(best.clock, exposure_slots=clock.exposure_slots))
-    yield corrected, initial_pass(corrected)
-
-
-def _starts(clock: Clock) -> Iterator[Clock]:
-    """The clock with each start of packets that has a part of header or dimming symbol in view."""
-    n, phase = clock.packet_slots, clock.first_slot % SLOTS_PER_SYMBOL
-    for first_slot in range(phase, n, SLOTS_PER_SYMBOL):
-        if first_slot < PREAMBLE_SLOTS or first_slot + clock.n_slots > n:
-            n_copies = -(-(first_slot + clock.n_slots) // n)
-            yield replace(clock, first_slot=first_slot, burst=np.arange(n_copies))

@@ -21,6 +21,12 @@ def log_evidence(reception: Reception) -> float:
     return _COLUMNS / llr.size * (float(np.logaddexp(llr, 0.0).sum()) + SETTINGS.header_weight * headers)
 
 
+def fit(reception: Reception) -> float:
+    """How well packets fit, for clocks whose slots are the same: in poor light all columns together show the start."""
+    llr = reception.column_llr
+    return _COLUMNS / llr.size * float(np.maximum(llr, SETTINGS.worst_fit).sum())
+
+
 def score(reception: Reception, evidence: float, log_prior: float) -> float:
     """Tempered evidence of distinct columns plus log prior.
 

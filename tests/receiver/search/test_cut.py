@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,11 +13,14 @@ from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.receiver import receive
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.camera import FrameCamera
+from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Received
+from rxcli.receiver.frame.timer import Timer
+from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import cut
-from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
-from rxcli.types import Clock, Frame, FrameResult, FrameSoftBits, SearchStep
+from rxcli.types import Clock, Frame, FrameResult, FrameSoftBits, RowProfiles, SearchStep
 
 SCREEN = load_profile("data-17k3", ScreenProfile)
 
@@ -41,7 +45,7 @@ def test_a_known_camera_is_not_asked_for_less_than_an_unknown_one(
     is_known: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Packets that are plain but none believable: their cut packets come first, then the soft bits as received."""
-    monkeypatch.setattr(receive, "proposed_screens", lambda *_: [[]])
+    monkeypatch.setattr(receive, "proposed_screens", lambda *_: [[Outline(np.zeros((4, 2)))]])
     monkeypatch.setattr(receive, "known_camera", lambda *_: receive.UNKNOWN if is_known else None)
     monkeypatch.setattr(receive, "cut_packets", lambda _: (shown,))
     shown, own = (FrameSoftBits(np.arange(1), np.full((1, 11, 20, 7), value, np.float32)) for value in (1, 0))
@@ -54,19 +58,36 @@ def test_a_known_camera_is_not_asked_for_less_than_an_unknown_one(
     assert soft.alternatives == (own,)
 
 
-def test_one_pass_tells_where_symbols_begin(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng, shot = np.random.default_rng(3), Shot(8.0, 0.8, 33.0, 560, texture=0.1, crosstalk=0.1)
+def seen(monkeypatch: pytest.MonkeyPatch, by_outline: list[RowProfiles]) -> list[FrameContext]:
+    """A frame by outlines that give some profiles, its camera known."""
+    frame = Frame(np.zeros((600, 600), np.uint8), "photo")
+    cache = cast(FrameCache, SimpleNamespace(frame=frame, timer=Timer()))
+    monkeypatch.setattr(FrameContext, "sample_columns", lambda self, _: by_outline[int(self.sampled_corners[0, 0])])
+    camera = FrameCamera("mine", 1 / (8 * SCREEN.slot_rate_hz), 0.8 / SCREEN.slot_rate_hz, None, "srgb")
+    return [FrameContext(cache, np.full((4, 2), n), camera, (SCREEN,)) for n in range(len(by_outline))]
+
+
+@pytest.mark.parametrize(
+    ("start_slot", "is_open"), [(33, True), (8, False), (95, False)], ids=["payload", "its header", "the next header"]
+)
+def test_the_start_of_a_cut_packet_is_found_on_a_textured_picture(
+    monkeypatch: pytest.MonkeyPatch, start_slot: int, is_open: bool
+) -> None:
+    rng = np.random.default_rng(3)
+    shot = Shot(8.0, 0.8, start_slot, 560, texture=0.5, texture_rows=9.0, crosstalk=0.1)
     profiles = row_profiles(random_link(rng, [5] * 20, SCREEN.payload_symbols), shot, rng)
-    camera = SimpleNamespace(line_delay_s=1 / (8.0 * SCREEN.slot_rate_hz), exposure_s=0.8 / SCREEN.slot_rate_hz)
-    context = SimpleNamespace(screens=(SCREEN,), camera=camera, sample_columns=lambda _: profiles)
-    passes: list[Acquisition] = []
-    monkeypatch.setattr(
-        cut, "initial_pass", lambda acquisition: passes.append(acquisition) or initial_pass(acquisition)
-    )
-    found = [candidate for candidate in cut._clocks(context) if candidate.acquisition.clock.header_peak_ratio == 0]
-    assert len(found) == 10 * SETTINGS.cut_phases
-    assert len(passes) <= SETTINGS.cut_phases + 1
-    clock = max(found, key=lambda candidate: candidate.evidence).acquisition.clock
-    # Row 0 is exposed around slot 33 of the packet.
-    off = (-clock.row0 / 8.0 + clock.first_slot - 33.0 + 5) % 10 - 5
-    assert abs(off) <= 0.5 / SETTINGS.cut_phases + 0.07
+    (slots,) = cut._slots_by(seen(monkeypatch, [profiles])[0])
+    best, *_ = cut._distinct(cut._candidates(slots))
+    clock = best.acquisition.clock
+    off = -clock.row0 / 8.0 + clock.first_slot - start_slot
+    assert best.is_open == is_open
+    assert (off + 5) % 10 - 5 == pytest.approx(0, abs=0.13)
+    assert is_open or off == pytest.approx(0, abs=0.13)
+
+
+def test_columns_are_told_apart_by_the_right_outline(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, shot = np.random.default_rng(4), Shot(8.0, 0.8, 33.0, 560, texture=0.2, crosstalk=0.1)
+    profiles = row_profiles(random_link(rng, [5] * 20, SCREEN.payload_symbols), shot, rng)
+    between = replace(profiles, light=(profiles.light + np.roll(profiles.light, 1, axis=0)) / 2)
+    right, wrong = cut._ways_to_read(seen(monkeypatch, [profiles, between]))
+    assert right.evidence > wrong.evidence + 1
