@@ -66,12 +66,19 @@ def cut_packets(contexts: Sequence[FrameContext]) -> tuple[FrameSoftBits, ...]:
         contexts: the frame by every outline, with its screens; its camera, or an unknown one.
     """
     with contexts[0].timer("detect"):
-        best = max(_ways_to_read(contexts), key=lambda slots: slots.evidence, default=None)
-        if best is None:
-            return ()
-        directions = (best,) if best.context.camera.hypothesis is None else (best, _backwards(best))
-        candidates = (candidate for slots in directions for candidate in _candidates(slots))
+        candidates = (candidate for slots in _best(_ways_to_read(contexts)) for candidate in _candidates(slots))
         return tuple(_soft_bits(candidate) for candidate in _distinct(candidates))
+
+
+def _best(ways: Iterable[_Slots]) -> Iterator[_Slots]:
+    """The slots with the largest evidence, of each rate by a known camera, in two directions by an unknown one."""
+    best: dict[float, _Slots] = {}
+    for slots in sorted(ways, key=lambda slots: slots.evidence):
+        best[0.0 if slots.context.camera.hypothesis else slots.screens[0].slot_rate_hz] = slots
+    for slots in best.values():
+        yield slots
+        if slots.context.camera.hypothesis is not None:
+            yield _backwards(slots)
 
 
 def _ways_to_read(contexts: Sequence[FrameContext]) -> Iterator[_Slots]:
