@@ -31,6 +31,8 @@ _LINE_POWER = 25.0
 MIN_PERIODS, FEW_PERIODS = 2.0, 6
 #: Minimum score of fewer periods.
 _FEW_SCORE = 0.6
+#: Minimum explained share of fits of some numbers of periods: the fewer, the better a scene can be fitted.
+_MIN_EXPLAINED = (2, 4, FEW_PERIODS, 2 * FEW_PERIODS), (0.985, 0.97, 0.93, 0.5)
 #: Relative gain of explained variance at which a sub-harmonic is taken for the fundamental.
 _SUBHARMONIC_SHARE = 0.08
 #: Fewest periods of a candidate, whose frequency is not exact yet; and share of the strongest candidate's power from
@@ -91,8 +93,7 @@ class PeriodicFit:
     @property
     def significant(self) -> bool:
         """Whether the fit is stripes and not a scene, in which a few waves can always be fitted badly."""
-        least = np.interp(self.periods, [2, 4, FEW_PERIODS, 2 * FEW_PERIODS], [0.985, 0.97, 0.93, 0.5])
-        return self.periods >= MIN_PERIODS and self.explained > float(least)
+        return self.periods >= MIN_PERIODS and self.explained > float(np.interp(self.periods, *_MIN_EXPLAINED))
 
 
 def _waves(rows: FloatArray, frequency: float, n_harmonics: int) -> tuple[FloatArray, FloatArray]:

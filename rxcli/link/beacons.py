@@ -15,18 +15,15 @@ from rxcli.link.formats import unprotect_beacon
 from rxcli.link.known_bits import KnownBits, known_bits
 from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
 from rxcli.link.placement import Placement, possible_placements
-from rxcli.link.softbits import Float32, log_likelihood, same_bits_llr, surprise
+from rxcli.link.softbits import LN2, MIN_SIMILARITY, TRY_FROM, Float32, log_likelihood, same_bits_llr, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
-#: Information at which a beacon is first decoded, its increase before the next attempt, and the upper limit; relative
-#: to the beacon's bits.
-_TRY_FROM, _RETRY_GAIN, _TRY_UP_TO = 1.02, 0.08, 2.5
+#: Increase of information before the next attempt to decode a beacon, and the upper limit; relative to its bits.
+_RETRY_GAIN, _TRY_UP_TO = 0.08, 2.5
 #: Bits that must be observed, relative to the beacon's: the others may be known.
 _MIN_OBSERVED = 0.5
 _ITERATIONS = 40
-#: Log-likelihood ratio below which bursts, or copies within one burst, do not carry the same message.
-_MIN_SIMILARITY = -8.0
-#: The same of bits that a message sends twice within a burst: one symbol may be misread.
+#: `MIN_SIMILARITY` of bits that a message sends twice within a burst: one symbol may be misread.
 MIN_REPEATED = -30.0
 #: Log-likelihood ratio above which bursts are copies of each other.
 _COPIES = 8.0
@@ -146,7 +143,7 @@ class BeaconSearch:
     def _joined(self, period: int, soft: FrameSoftBits, settled: Placement | None) -> _Round | None:
         """Add the bursts to their round or to a new one; None if they contradict each other."""
         frame = _frame_sum(soft, period)
-        if frame.similarity() < _MIN_SIMILARITY:
+        if frame.similarity() < MIN_SIMILARITY:
             return None
         rounds, as_numbered = self._rounds[period], settled or Placement()
         choices = [
@@ -162,13 +159,13 @@ class BeaconSearch:
             # Photographs may be numbered otherwise; that they carry the same message must then be certain.
             elsewhere = [placement for group in possible_placements(frame.total)[1:] for placement in group]
             choices += [
-                (known.gain(frame, phase, placement) + _MIN_SIMILARITY - _COPIES, place, phase, placement)
+                (known.gain(frame, phase, placement) + MIN_SIMILARITY - _COPIES, place, phase, placement)
                 for place, known in enumerate(rounds)
                 if known.epoch != soft.epoch
                 for phase, placement in product(range(period), elsewhere)
             ]
         gain, place, phase, placement = max(choices, key=itemgetter(0), default=(-np.inf, 0, 0, as_numbered))
-        if gain > _MIN_SIMILARITY:
+        if gain > MIN_SIMILARITY:
             candidate = rounds.pop(place)
         else:
             blank = np.zeros((period, *self._shape), np.float32)
@@ -207,7 +204,7 @@ class BeaconSearch:
     ) -> Iterator[tuple[Placement, tuple[MessageKind, bytes]]]:
         """Decode a candidate under a group of placements, and yield each one that gives a message."""
         total, key = np.roll(candidate.total, phase, axis=0), (layout.length, phase, group)
-        last = candidate.tried.get(key, _TRY_FROM - _RETRY_GAIN)
+        last = candidate.tried.get(key, TRY_FROM - _RETRY_GAIN)
         if last >= _TRY_UP_TO:
             return
         buffers = np.stack([gathered(layout, placement.of(total)) for placement in placements])
@@ -261,4 +258,4 @@ def read_words(
 def is_likely(layout: BeaconLayout, information_bits: NDArray[np.uint8], buffer: Float32, n_known: float = 0.0) -> bool:
     """Whether a decoded word agrees with the soft bits, from which its known bits do not follow."""
     word = ldpc.encode(layout.code, np.asarray(information_bits, np.uint8)[None])[0, : buffer.size]
-    return bool(log_likelihood(word, buffer) > _MIN_LIKELIHOOD * (layout.code.k - n_known) * np.log(2.0))
+    return bool(log_likelihood(word, buffer) > _MIN_LIKELIHOOD * (layout.code.k - n_known) * LN2)

@@ -8,9 +8,9 @@ import numpy as np
 from rxcli.link.beacons import MIN_REPEATED, gathered, read_words
 from rxcli.link.formats import unprotect_beacon
 from rxcli.link.known_bits import known_bits
-from rxcli.link.layout import BEACON_LENGTHS, beacon_layout
+from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
 from rxcli.link.placement import Placement, possible_placements
-from rxcli.link.softbits import Float32, same_bits_llr, surprise
+from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, same_bits_llr, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
 Found = tuple[tuple[MessageKind, bytes], Placement]
@@ -18,10 +18,8 @@ Found = tuple[tuple[MessageKind, bytes], Placement]
 _MAX_SUMS, _MAX_VIEWS, _BATCH = 192, 96, 64
 #: Views of a photograph that are decoded by themselves first; and log-likelihood ratio of zeros that ranks views.
 _ALONE, _CLEAR_ZEROS = 64, 8.0
-#: Log-likelihood ratio below which photographs do not show the same text; and from which they certainly do.
-_MIN_SIMILARITY, _SAME = -8.0, 16.0
-#: Information at which a text is decoded, relative to its bits; and log-likelihood ratio below which a bit is unknown.
-_TRY_FROM, _UNKNOWN = 1.02, 1e-3
+#: Log-likelihood ratio from which photographs certainly show the same text; and below which a bit is unknown.
+_SAME, _UNKNOWN = 16.0, 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +70,7 @@ class CutPhotos:
         ][: 2 * _MAX_SUMS]
         untried = [s for s in sums[: 2 * _MAX_SUMS] if not s.is_tried]
         for layout in self._layouts:
-            found = next(self._read(layout.length, untried), None)
+            found = next(_read(layout, untried), None)
             if found is not None:
                 self._sums = [found[1]]
                 return [(found[0], found[1].placement)]
@@ -90,29 +88,29 @@ class CutPhotos:
         ranked = [replace(view, zeros=float(llr)) for view, llr in zip(views, zeros, strict=True)]
         return sorted(ranked, key=lambda view: -round(view.zeros / _CLEAR_ZEROS))
 
-    def _read(self, length: int, sums: list[_Sum]) -> Iterator[tuple[tuple[MessageKind, bytes], _Sum]]:
-        """Texts of a length that sums show."""
-        layout = next(layout for layout in self._layouts if layout.length == length)
-        for start in range(0, len(sums), _BATCH):
-            gathering = ((gathered(layout, s.total[None]), s) for s in sums[start : start + _BATCH])
-            # Bits that are sent twice agree.
-            agreeing = [(b, s) for b, s in gathering if same_bits_llr(b, s.level) >= MIN_REPEATED]
-            if not agreeing:
-                continue
-            buffers, part = np.stack([b for b, _ in agreeing]), [s for _, s in agreeing]
-            known = known_bits(layout, buffers)
-            which = np.flatnonzero(known.information(buffers) > _TRY_FROM * layout.code.k)
-            words = read_words(layout, buffers[which], known=known.of(which)) if which.size else []
-            for place, word in zip(which.tolist(), words, strict=True):
-                found = None if word is None else unprotect_beacon(word)
-                if found is not None:
-                    yield found, part[place]
+
+def _read(layout: BeaconLayout, sums: list[_Sum]) -> Iterator[tuple[tuple[MessageKind, bytes], _Sum]]:
+    """Texts of a layout that sums show."""
+    for start in range(0, len(sums), _BATCH):
+        gathering = ((gathered(layout, s.total[None]), s) for s in sums[start : start + _BATCH])
+        # Bits that are sent twice agree.
+        agreeing = [(b, s) for b, s in gathering if same_bits_llr(b, s.level) >= MIN_REPEATED]
+        if not agreeing:
+            continue
+        buffers, part = np.stack([b for b, _ in agreeing]), [s for _, s in agreeing]
+        known = known_bits(layout, buffers)
+        which = np.flatnonzero(known.information(buffers) > TRY_FROM * layout.code.k)
+        words = read_words(layout, buffers[which], known=known.of(which)) if which.size else []
+        for place, word in zip(which.tolist(), words, strict=True):
+            found = None if word is None else unprotect_beacon(word)
+            if found is not None:
+                yield found, part[place]
 
 
 def _views(soft: FrameSoftBits) -> Iterator[_Sum]:
     """What a photograph may show: every clock, start of its packets and placement of its columns, likeliest first."""
     of_one_packet = [
-        c for c in (soft, *soft.alternatives) if same_bits_llr(c.llr.sum(axis=0), _level(c.llr)) > _MIN_SIMILARITY
+        c for c in (soft, *soft.alternatives) if same_bits_llr(c.llr.sum(axis=0), _level(c.llr)) > MIN_SIMILARITY
     ]
     for group in range(3):
         for candidate in of_one_packet:
@@ -139,6 +137,6 @@ def _joined(known: _Sum, view: _Sum) -> _Sum | None:
     total = known.total + view.total
     level = _level(total)
     gain = level - known.level - view.level
-    if gain < _MIN_SIMILARITY:
+    if gain < MIN_SIMILARITY:
         return None
     return _Sum(total, known.similarity + gain, level, view.placement, known.zeros + view.zeros)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.link import ldpc
+from rxcli.link import ldpc, softbits
 from rxcli.link.beacons import gathered, is_likely, read_words
 from rxcli.link.formats import (
     Announcement,
@@ -22,12 +22,9 @@ from rxcli.link.formats import (
 from rxcli.link.layout import ANNOUNCEMENT_PERIOD, CRC_BYTES, LABEL_BITS, FileLayout, announcement_layout
 from rxcli.link.placement import Placement, possible_placements
 from rxcli.link.sequences import whiten
-from rxcli.link.softbits import INFORMATION_OF_STEPS, Float32, information, log_likelihood, same_bits_llr, surprise
+from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, information, log_likelihood, same_bits_llr, surprise
 from rxcli.types import FILE_MEMORY_MB, FrameSoftBits, ObjectProgress
 
-_LN2 = float(np.log(2.0))
-#: Information at which an announcement is decoded, relative to its bits; and the minimum similarity of its copies.
-_TRY_ANNOUNCEMENT, _MIN_SIMILARITY = 1.02, -8.0
 #: Batch size for announcements whose copies do not decide.
 _ANNOUNCEMENTS_AT_ONCE = 32
 #: Bursts in which announcements are tried under shifted column numbers.
@@ -136,7 +133,9 @@ class FileState:
         before = flat[place]
         after = np.clip(before + more, -127, 127).astype(np.int8)
         flat[place] = after
-        gain = INFORMATION_OF_STEPS[after.view(np.uint8)] - INFORMATION_OF_STEPS[before.view(np.uint8)]
+        gain = (
+            softbits.INFORMATION_OF_STEPS[after.view(np.uint8)] - softbits.INFORMATION_OF_STEPS[before.view(np.uint8)]
+        )
         self.known += np.bincount(block, gain.reshape(block.size, -1).sum(axis=1), self.layout.n_blocks)
 
     def _open(self) -> NDArray[np.bool_]:
@@ -263,7 +262,7 @@ def _is_likely(layout: FileLayout, information_bits: NDArray[np.uint8], llr: NDA
     """Whether a decoded block agrees with the soft bits of its information part, which every fragment contains."""
     sent = information_bits[layout.code.first_sent :]
     received = llr[: sent.size] * ldpc.LLR_STEP
-    return bool(log_likelihood(sent, received) > _MIN_LIKELIHOOD * _LN2 * information(received).sum())
+    return bool(log_likelihood(sent, received) > _MIN_LIKELIHOOD * softbits.LN2 * information(received).sum())
 
 
 @dataclass(slots=True, eq=False)
@@ -349,11 +348,11 @@ class FileSearch:
     def _look_for_announcement(self, candidate: _Candidate, llr: Float32) -> None:
         candidate.buffer = gathered(self._layout, llr)
         similarity = same_bits_llr(candidate.buffer, float(surprise(llr).sum(dtype=np.float64)))
-        if similarity < _MIN_SIMILARITY:
+        if similarity < MIN_SIMILARITY:
             return
-        if information(candidate.buffer).sum() < _TRY_ANNOUNCEMENT * self._layout.code.k:
+        if information(candidate.buffer).sum() < TRY_FROM * self._layout.code.k:
             return
-        if similarity > -_MIN_SIMILARITY:
+        if similarity > -MIN_SIMILARITY:
             if not self._is_expected(candidate):
                 self._try_candidates([candidate])
         elif candidate.epoch not in self._timelines:

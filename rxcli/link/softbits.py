@@ -9,8 +9,11 @@ from rxcli.types import Message, ReceivedObject
 Float32 = NDArray[np.float32]
 #: Limit of log-likelihood ratios in the decoder.
 MAX_LLR = 127 * LLR_STEP
-_LN2 = float(np.log(2.0))
-
+#: Log-likelihood ratio below which soft bits that were added do not belong to the same bits.
+MIN_SIMILARITY = -8.0
+#: Information at which a beacon or an announcement is first decoded, relative to its bits.
+TRY_FROM = 1.02
+LN2 = float(np.log(2.0))
 
 Event = Message | ReceivedObject
 
@@ -20,7 +23,7 @@ Event = Message | ReceivedObject
 def surprise(llr: Float32) -> Float32:
     """ln(1 + e^llr) - ln 2, a term of `same_bits_llr`."""
     # Single precision suffices for sums; its logarithm is fast, its log1p is not.
-    return np.asarray(np.log(1 + np.exp(-np.abs(llr))) + np.maximum(llr, 0) - np.float32(_LN2), np.float32)
+    return np.asarray(np.log(1 + np.exp(-np.abs(llr))) + np.maximum(llr, 0) - np.float32(LN2), np.float32)
 
 
 def same_bits_llr(together: Float32, alone: float) -> float:
@@ -38,7 +41,7 @@ def information(llr: NDArray[np.floating]) -> NDArray[np.float64]:
     a = np.minimum(np.abs(np.asarray(llr, np.float64)), 40.0)
     odds = np.exp(-a)
     # H2 of 1 / (1 + e^a), natural logarithm: ln(1 + e^-a) + a / (1 + e^a).
-    return np.asarray(1 - (np.log1p(odds) + a * odds / (1 + odds)) / _LN2)
+    return np.asarray(1 - (np.log1p(odds) + a * odds / (1 + odds)) / LN2)
 
 
 #: Information, bits, of a ratio in the decoder's steps, indexed by its value as uint8.
@@ -48,4 +51,4 @@ INFORMATION_OF_STEPS = information(np.arange(256, dtype=np.uint8).view(np.int8) 
 def log_likelihood(bits: NDArray[np.uint8], llr: NDArray[np.floating]) -> NDArray[np.float64]:
     """Log-likelihood of bits relative to arbitrary bits, summed over the last axis."""
     signed = np.where(bits > 0, llr, -llr).astype(np.float64)
-    return np.asarray((_LN2 - np.log1p(np.exp(-np.abs(signed))) + np.minimum(signed, 0)).sum(axis=-1))
+    return np.asarray((LN2 - np.log1p(np.exp(-np.abs(signed))) + np.minimum(signed, 0)).sum(axis=-1))

@@ -95,15 +95,14 @@ def exposure_shares(
     return np.asarray(np.maximum(reach, 0) / exposure_slots)
 
 
-def sees_dark_header(places: FloatArray, exposure_slots: float, min_reach: float = 0.0) -> BoolArray:
-    """Whether exposures lie entirely in the three dark slots in the middle of a header.
+def sees_dark_header(places: FloatArray, exposure_slots: float) -> BoolArray:
+    """Whether exposures lie in the three dark slots in the middle of a header; long ones, at most half a slot off.
 
     Args:
         places: centres of the exposures, slots from the start of a packet.
         exposure_slots: length of the exposures, slots.
-        min_reach: distance from the middle, slots, that counts for any exposure.
     """
-    reach = max((_DARK_TO - _DARK_FROM - exposure_slots) / 2, min_reach)
+    reach = max((_DARK_TO - _DARK_FROM - exposure_slots) / 2, 0.5)
     return np.asarray(np.abs(places - (_DARK_FROM + _DARK_TO) / 2) <= reach)
 
 

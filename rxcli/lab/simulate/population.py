@@ -119,7 +119,7 @@ def log_uniform(rng: Generator, limits: Range) -> float:
 
 
 def _within(rng: Generator, limits: Range) -> float:
-    """The same, without a draw where there is nothing to draw."""
+    """As `log_uniform`; equal limits take no random number, so that what is drawn after them stays the same."""
     return limits[0] if limits[0] == limits[1] else log_uniform(rng, limits)
 
 

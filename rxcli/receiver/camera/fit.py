@@ -93,7 +93,6 @@ def _chi_square(values: FloatArray, covariance: FloatArray) -> float:
 class _Near:
     """The light of strips (M, R) as a local level plus a local gain times a wave."""
 
-    wave: Float32Array
     gain: Float32Array
     residual: Float32Array
     #: Inverse variance of the residuals thereabouts, noise included; 0 off the screen.
@@ -168,7 +167,7 @@ class _Model:
         residual = (light - self._mean - gain * (wave - mean)) * inside
         weight = inside / (self._local(residual * residual) + self.strips.noise.variance(self._mean))
         power, left = (float((square * weight).sum()) for square in (gain * gain * variance, residual * residual))
-        return _Near(wave, gain, residual, weight, power / max(power + left, TINY))
+        return _Near(gain, residual, weight, power / max(power + left, TINY))
 
     def _step(
         self, values: FloatArray, times: Float32Array, near: _Near, slope: Float32Array, free: IntArray

@@ -126,16 +126,15 @@ def _strongest_line(
     """Rows a slot of the strongest line of the slots on stripes of one bend, and its strength."""
     columns = columns_of(straightened(strips, level, curvature), strips.n_columns)
     line, n_rows = _slot_line(columns), columns.shape[1]
-    low, high = _line_places(width, strips.pitch, n_rows)
+    low, high = (int(_FINE * n_rows / rows) for rows in reversed(_slot_range(width, strips.pitch)))
     (place,) = low + _peaks(line[low : high + 2], 1, 1) if high > low + 2 else (0.0,)
     return (_FINE * n_rows / place * strips.pitch, float(line[round(place)])) if place > 0 else (width, 0.0)
 
 
-def _line_places(width: float, pitch: float, n_rows: int) -> tuple[int, int]:
-    """Places of the slots' line, for stripes of a half width."""
-    shortest, longest = (width / slots / pitch for slots in reversed(SETTINGS.half_width_slots))
-    shortest = max(shortest, SETTINGS.min_rows_per_slot / pitch)
-    return int(_FINE * n_rows / longest), int(_FINE * n_rows / shortest)
+def _slot_range(width: float, pitch: float) -> tuple[float, float]:
+    """Fewest and most joined rows of a slot, for stripes of a half width."""
+    fewest, most = (width / slots / pitch for slots in reversed(SETTINGS.half_width_slots))
+    return max(fewest, SETTINGS.min_rows_per_slot / pitch), most
 
 
 def _distinct(found: Iterable[CameraHypothesis]) -> list[CameraHypothesis]:
@@ -200,8 +199,7 @@ def _clocks(
     correlation = _autocorrelation(columns)
     # Of the light itself: soft signs have steeper edges.
     half_width = _half_width(_autocorrelation(straight.reshape(strips.n_columns, -1, n_rows).mean(axis=1)))
-    shortest, longest = (width / slots / pitch for slots in reversed(SETTINGS.half_width_slots))
-    shortest = max(shortest, SETTINGS.min_rows_per_slot / pitch)
+    shortest, longest = _slot_range(width, pitch)
     # The line: places are cycles over the picture, times _FINE.
     line = _slot_line(columns)
     low, high = (int(_FINE * n_rows / rows) for rows in (longest, shortest))

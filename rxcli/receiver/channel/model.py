@@ -80,7 +80,7 @@ def estimate_black_level(samples: SlotSamples, clock: Clock) -> float | None:
     """The light of a dark slot: the median over the three dark slots in the middle of headers; None without any."""
     q = samples.samples_per_slot
     places = (np.arange(samples.light.shape[-1]) + 0.5) / q + clock.first_slot
-    dark = sees_dark_header(places % clock.packet_slots, clock.exposure_slots, min_reach=0.5)
+    dark = sees_dark_header(places % clock.packet_slots, clock.exposure_slots)
     observed = samples.light[..., dark][samples.valid[..., dark] > 0]
     return float(np.median(observed)) if observed.size else None
 

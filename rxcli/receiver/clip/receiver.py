@@ -301,7 +301,7 @@ def _receive_anew(
 
 
 def _can_track(acquired: Acquired, options: ReceiverOptions) -> bool:
-    """Whether a row of the picture is one instant, in the order of time."""
+    """Whether strips can be followed from frame to frame: each row of the picture is one instant, in order of time."""
     return (
         "tracking" in options.skip
         and acquired.context.frame.mosaic is None

@@ -46,7 +46,7 @@ def bright_quadrilateral(plane: LightPlane) -> FloatArray | None:
 
 
 def striped_box(plane: LightPlane) -> FloatArray | None:
-    """Corners (4, 2) of the upright rectangle around the largest part of a picture that shows stripes, as above."""
+    """Corners (4, 2) of the upright rectangle around the largest striped part of a picture; None without stripes."""
     import cv2
 
     light, pixels = _cells(plane)
