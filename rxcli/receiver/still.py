@@ -178,8 +178,7 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     by_start = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
 
     def of_bursts(clock: Clock, lit: Float32Array | None) -> BurstSamples:
-        noise, crosstalk = model.noise, model.crosstalk
-        return ratios.burst_samples(by_start, clock, model.black_level, noise, crosstalk, columns, lit)
+        return ratios.burst_samples(by_start, clock, model, columns, lit)
 
     single = clock.by_copy
     alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
@@ -225,7 +224,7 @@ def _joint_samples(
 ) -> tuple[SlotSamples, BurstSamples]:
     clock, columns = acquisition.clock, np.arange(len(acquisition.profiles.light))
     samples = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
-    bursts = ratios.burst_samples(samples, clock, model.black_level, model.noise, model.crosstalk, columns, lit)
+    bursts = ratios.burst_samples(samples, clock, model, columns, lit)
     return samples, _with_weights(bursts, w_log_prob, np.full((bursts.n_bursts, 1, 1), STILL.min_weight_log_prior))
 
 
@@ -275,7 +274,7 @@ def follow_picture(
         clock = reception.clock
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), q, ratios.by_start(clock))
     lit = clock.on_grid(reception.posteriors.lit)
-    bursts = ratios.burst_samples(samples, clock, model.black_level, model.noise, model.crosstalk, columns, lit)
+    bursts = ratios.burst_samples(samples, clock, model, columns, lit)
     if not reception.is_long:
         # Paths that see nothing of a packet's start would keep the weights of fewest words.
         dimming = reception.n_observed[:, columns, SLOTS_PER_SYMBOL:PREAMBLE_SLOTS].sum(axis=2, keepdims=True)
@@ -308,9 +307,8 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
 
     def evidence(clock: Clock, levels: list[float]) -> FloatArray:
         samples, model = _view(acquisition, reception, every, STILL.coarse_samples, ratios.by_start(clock))
-        parts = [
-            ratios.burst_samples(samples, clock, level, model.noise, model.crosstalk, some, lit) for level in levels
-        ]
+        models = (replace(model, black_level=level) for level in levels)
+        parts = [ratios.burst_samples(samples, clock, each, some, lit) for each in models]
         by_lane = survivors.lane_log_evidence(survivors.side_by_side(parts), QUICK_SURVIVORS)
         return np.asarray(by_lane.reshape(len(levels), -1, some.size).sum(axis=1))
 

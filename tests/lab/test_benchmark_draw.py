@@ -14,6 +14,7 @@ from rxcli.lab.benchmark.draw import DRAWERS, Place
 from rxcli.lab.benchmark.measures import MEASURES
 from rxcli.lab.benchmark.media import Medium
 from rxcli.lab.benchmark.runner import scenarios
+from rxcli.lab.simulate.files import Encoding
 from rxcli.lab.simulate.no_data import EVEN_KINDS, NO_DATA_KINDS, STRIPED_KINDS
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.pictures import DARK_KINDS, draw_dark_picture
@@ -105,7 +106,7 @@ def test_every_other_picture_without_data_is_striped(tmp_path: Path) -> None:
 def test_files_of_captures_go_away(tmp_path: Path) -> None:
     small = preset("video-1080p", "paper-8k65").scaled(0.2, 0.2, keep_readout=True)
     with draw.recorded(
-        replace(small, n_frames=2), Place(0, 44, {}, tmp_path), encoding=("hevc", "veryfast", 10**6)
+        replace(small, n_frames=2), Place(0, 44, {}, tmp_path), encoding=Encoding("hevc", 10**6)
     ) as case:
         (path,) = case.source
         assert isinstance(path, Path)

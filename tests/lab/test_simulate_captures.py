@@ -22,7 +22,7 @@ from rxcli.errors import ReceiverError
 from rxcli.ingest import open_source
 from rxcli.lab.simulate.camera import render_band
 from rxcli.lab.simulate.capture import prepare, simulate_frame
-from rxcli.lab.simulate.files import write_dng, write_video
+from rxcli.lab.simulate.files import Encoding, write_dng, write_video
 from rxcli.lab.simulate.scenes import PRESETS, Scene, preset
 from rxcli.protocol import codebook
 from rxcli.resources import data_dir
@@ -43,7 +43,7 @@ def run(*args: str) -> Any:
 @pytest.mark.parametrize("orientation", [1, 3])
 def test_a_clip_notes_how_its_camera_was_held(orientation: int, tmp_path: Path) -> None:
     pictures = [np.zeros((32, 48, 3), np.uint8)] * 2
-    write_video(pictures, tmp_path / "a.mp4", "h264", 30, orientation=orientation)
+    write_video(pictures, tmp_path / "a.mp4", Encoding("h264"), 30, orientation=orientation)
     assert {frame.metadata.orientation for frame in open_source(tmp_path / "a.mp4")} == {orientation}
 
 

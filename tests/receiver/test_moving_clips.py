@@ -14,7 +14,7 @@ import pytest
 from rxcli.ingest import open_source
 from rxcli.ingest.video import _Progress, _time_s
 from rxcli.lab.simulate.capture import Recording, prepare
-from rxcli.lab.simulate.files import write_video
+from rxcli.lab.simulate.files import Encoding, write_video
 from rxcli.lab.simulate.scenes import Change, Scene, preset
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.options import SKIPS, ReceiverOptions
@@ -281,7 +281,7 @@ def test_files_of_24_to_240_frames_a_second(rate_hz: int, n_frames: int, share: 
     take = at_rate(rate_hz, "paper-17k3", n_frames)
     path, sensor = tmp_path / "clip.mp4", take.scene.sensor
     bit_rate = int(0.6 * sensor.width * sensor.height * rate_hz)
-    write_video((take.frame(k).rgb for k in range(n_frames)), path, "h264", rate_hz, bit_rate)
+    write_video((take.frame(k).rgb for k in range(n_frames)), path, Encoding("h264", bit_rate), rate_hz)
     whole = len(shown_as_a_whole(take, margin=2.0)) * 20
     assert whole >= 20
     for options in (options_of(take), ReceiverOptions()):

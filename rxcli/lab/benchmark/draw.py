@@ -19,7 +19,7 @@ from rxcli.lab.benchmark.cases import Case
 from rxcli.lab.benchmark.media import Medium, camera_path
 from rxcli.lab.benchmark.trial import Trial, known_camera, known_corners, write_still
 from rxcli.lab.simulate.capture import prepare
-from rxcli.lab.simulate.files import encode_jpeg, write_video
+from rxcli.lab.simulate.files import Encoding, encode_jpeg, write_video
 from rxcli.lab.simulate.no_data import STRIPED_KINDS, draw_kind, no_data_scene
 from rxcli.lab.simulate.pictures import DARK_KINDS
 from rxcli.lab.simulate.population import Population, Range, log_uniform
@@ -57,9 +57,7 @@ class Place:
 #: Photographs of one transmission follow each other so often.
 _PHOTOS_HZ = 0.4
 _LETTERS = tuple("abcdefghijklmnopqrstuvwxyz 0123456789")
-#: Codec, preset and bits per second.
-Encoding = tuple[str, str, int]
-_ENCODING = ("h264", "veryfast", 8_000_000)
+_ENCODING = Encoding("h264", 8_000_000)
 
 
 class People(Population, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -81,7 +79,8 @@ class People(Population, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def encoding(self, scene: Scene, rng: np.random.Generator) -> Encoding:
         """How a clip is compressed."""
         bits = log_uniform(rng, self.bits_per_pixel) * scene.sensor.width * scene.sensor.height
-        return str(rng.choice(self.codecs)), str(rng.choice(self.efforts)), int(bits * scene.frame_rate_hz)
+        codec, preset = (str(rng.choice(some)) for some in (self.codecs, self.efforts))
+        return Encoding(codec, int(bits * scene.frame_rate_hz), preset)
 
 
 def draw_people(at: Place) -> Iterator[Case]:
@@ -115,9 +114,8 @@ def recorded(scene: Scene, at: Place, photos: int = 1, encoding: Encoding = _ENC
         trials = [] if scene.n_frames > 1 else [Trial(frame, frame.frame) for frame in frames]
         paths = [write_still(trial.capture, Path(folder) / str(trial.index)) for trial in trials]
         if not trials:
-            paths, (codec, effort, bit_rate) = [Path(folder) / "0.mp4"], encoding
-            rgb = (frame.rgb for frame in frames)
-            write_video(rgb, paths[0], codec, scene.frame_rate_hz, bit_rate, effort, scene.orientation)
+            paths = [Path(folder) / "0.mp4"]
+            write_video((frame.rgb for frame in frames), paths[0], encoding, scene.frame_rate_hz, scene.orientation)
         about = {"screen": scene.screen.name, "camera": scene.camera_name, "rows_per_slot": scene.rows_per_slot}
         known: dict[str, Any] = {"truth": msgspec.convert(whole, Truth, str_keys=True), "whole_truth": whole}
         corners, cameras = known_corners(exposure), (known_camera(exposure),)

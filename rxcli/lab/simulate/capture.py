@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rxcli.lab.simulate.bound import Oracle, OracleRecorder
 from rxcli.lab.simulate.camera import Exposure, take_picture
-from rxcli.lab.simulate.files import CODECS, encode_jpeg, write_dng, write_png, write_tiff, write_video
+from rxcli.lab.simulate.files import CODECS, Encoding, encode_jpeg, write_dng, write_png, write_tiff, write_video
 from rxcli.lab.simulate.isp import develop
 from rxcli.lab.simulate.motion import HandMotion, turned
 from rxcli.lab.simulate.optics import FloatArray, View, homography
@@ -203,7 +203,7 @@ def write_capture(
     if file_format in CODECS:
         bits = 16 if CODECS[file_format].bits > 8 else 8
         frames = (recording.frame(number).developed(bits) for number in progress(range(scene.n_frames)))
-        write_video(frames, path, file_format, scene.frame_rate_hz, bit_rate, orientation=scene.orientation)
+        write_video(frames, path, Encoding(file_format, bit_rate), scene.frame_rate_hz, scene.orientation)
     elif file_format == "jpeg":
         path.write_bytes(recording.frame().jpeg)
     elif file_format.startswith("dng"):

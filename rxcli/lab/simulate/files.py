@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import av
 import cv2
@@ -170,36 +170,39 @@ CODECS = {
 _UPSIDE_DOWN = 3
 
 
+class Encoding(NamedTuple):
+    """How a clip is compressed."""
+
+    #: One of `CODECS`.
+    codec: str
+    #: Bits per second; None for the encoder's constant quality.
+    bit_rate: int | None = None
+    #: How much work the encoder does; see x264 and x265.
+    preset: str = "veryfast"
+
+
 def write_video(
-    frames: Iterable[NDArray[np.generic]],
-    path: Path,
-    codec: str,
-    frame_rate_hz: float,
-    bit_rate: int | None = None,
-    preset: str = "veryfast",
-    orientation: int = 1,
+    frames: Iterable[NDArray[np.generic]], path: Path, encoding: Encoding, frame_rate_hz: float, orientation: int = 1
 ) -> None:
     """Compress developed pictures into a clip.
 
     Args:
         frames: each (height, width, 3), red first, uint8, or uint16 for the codecs of ten bits.
         path: of the file; its suffix chooses the container.
-        codec: one of `CODECS`.
+        encoding: how it is compressed.
         frame_rate_hz: of the clip.
-        bit_rate: bits per second; None for the encoder's constant quality.
-        preset: how much work the encoder does; see x264 and x265.
         orientation: EXIF orientation of a camera held upright or upside down, 1 or 3, which the container notes.
 
     Raises:
         UsageError: this machine's FFmpeg lacks the codec.
     """
-    settings, rate = CODECS[codec], Fraction(frame_rate_hz).limit_denominator(1001)
+    settings, rate = CODECS[encoding.codec], Fraction(frame_rate_hz).limit_denominator(1001)
     ranges: dict[str, Any] = {"src_color_range": _JPEG_RANGE, "dst_color_range": settings.colour_range}
     with av.open(str(path), "w") as container:
         stream = None
         for number, rgb in enumerate(frames):
             if stream is None:
-                stream = _add_stream(container, settings, rate, rgb.shape, bit_rate, preset)
+                stream = _add_stream(container, encoding, rate, rgb.shape)
                 if orientation == _UPSIDE_DOWN:
                     stream.set_display_rotation(180)
             pixels = "rgb24" if rgb.dtype == np.uint8 else "rgb48le"
@@ -211,9 +214,8 @@ def write_video(
             container.mux(stream.encode(None))
 
 
-def _add_stream(
-    container: Any, settings: Codec, rate: Fraction, shape: tuple[int, ...], bit_rate: int | None, preset: str
-) -> Any:
+def _add_stream(container: Any, encoding: Encoding, rate: Fraction, shape: tuple[int, ...]) -> Any:
+    settings = CODECS[encoding.codec]
     try:
         stream = container.add_stream(settings.encoder, rate=rate)
     except (av.error.FFmpegError, ValueError) as error:
@@ -224,10 +226,10 @@ def _add_stream(
     context = stream.codec_context
     context.color_range = settings.colour_range
     context.colorspace = context.color_trc = context.color_primaries = _BT709
-    if bit_rate is not None:
-        stream.bit_rate = bit_rate
+    if encoding.bit_rate is not None:
+        stream.bit_rate = encoding.bit_rate
     if settings.encoder != "mjpeg":
-        stream.options = {"preset": preset} | ({} if bit_rate else {"crf": "23"})
+        stream.options = {"preset": encoding.preset} | ({} if encoding.bit_rate else {"crf": "23"})
         if settings.encoder == "libx265":
             # Reordered frames of a clip shorter than the encoder's delay get times that no container takes; and the
             # encoders in cameras do not reorder either.

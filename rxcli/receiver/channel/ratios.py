@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import mean_of_valid
 from rxcli.protocol import SLOTS_PER_SYMBOL
+from rxcli.receiver.channel.model import ObservationModel
 from rxcli.receiver.channel.settings import SETTINGS
-from rxcli.receiver.light import Crosstalk, NoiseModel, exposed_from
+from rxcli.receiver.light import exposed_from
 from rxcli.types import BurstSamples, Clock, Float32Array, IntArray, SlotSamples
 
 
@@ -19,35 +20,27 @@ def by_start(clock: Clock) -> Clock:
 
 
 def burst_samples(
-    samples: SlotSamples,
-    clock: Clock,
-    black_level: float,
-    noise: NoiseModel,
-    crosstalk: Crosstalk,
-    columns: IntArray,
-    lit: Float32Array | None = None,
+    samples: SlotSamples, clock: Clock, model: ObservationModel, columns: IntArray, lit: Float32Array | None
 ) -> BurstSamples:
     """Samples of the bursts of some columns.
 
     Args:
         samples: of all columns, see `by_start`.
         clock: the clock, its copies assigned to bursts.
-        black_level: light of a dark slot.
-        noise: of a sample.
-        crosstalk: of the strips.
+        model: of the samples.
         columns: numbers of the columns to detect.
         lit: (C, N) probability that each slot is lit, all columns; None: unknown, the light itself serves.
     """
     q = samples.samples_per_slot
-    above = (samples.light - np.float32(black_level)) * samples.valid
+    above = (samples.light - np.float32(model.black_level)) * samples.valid
     mean = mean_of_valid(above, samples.valid, SLOTS_PER_SYMBOL * q) if samples.level is None else samples.level
-    mean = np.maximum(mean, np.float32(SETTINGS.min_level_sigmas * noise.sigma))
+    mean = np.maximum(mean, np.float32(SETTINGS.min_level_sigmas * model.noise.sigma))
     light = np.asarray(above / mean, np.float32)
     ahead = np.diff(clock.delay_slots) * q if clock.delay_slots.any() else None
     own = own_light(light) if lit is None else light_of(lit, clock.exposure_slots, q)
-    neighbours = crosstalk.from_neighbours(own, columns, ahead)
+    neighbours = model.crosstalk.from_neighbours(own, columns, ahead)
     light, mean, valid = light[columns], mean[columns], samples.valid[columns]
-    variance = noise.variance(above[columns]) / np.square(mean)
+    variance = model.noise.variance(above[columns]) / np.square(mean)
     variance += np.square(light) * np.float32(SETTINGS.relative_error**2)
 
     def lanes(values: NDArray[np.floating[Any]]) -> Float32Array:
@@ -60,7 +53,7 @@ def burst_samples(
         noise=np.where(visible > 0, lanes(variance), np.float32(1)),
         valid=visible,
         neighbours=lanes(neighbours),
-        own=np.tile(crosstalk.own.ravel(), int(np.bincount(clock.burst).max())),
+        own=np.tile(model.crosstalk.own.ravel(), int(np.bincount(clock.burst).max())),
         exposure_slots=clock.exposure_slots,
         log_scale=scale,
         n_bursts=int(clock.burst.max()) + 1,
