@@ -9,7 +9,7 @@ from rxcli.types import Float32Array, Frame, Mosaic
 _GREEN = 1
 
 
-def light_of(frame: Frame) -> Float32Array:
+def frame_light(frame: Frame) -> Float32Array:
     """(height, width) values proportional to light, as far as the file states: 0 black, 1 white.
 
     Of a mosaic the green pixels of each row stand for the whole row: rows are not mixed, and a coloured lamp makes no

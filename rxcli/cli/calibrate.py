@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from rxcli.calibrate.frames import light_of
+from rxcli.calibrate.frames import frame_light
 from rxcli.calibrate.gyroflow import load_gyroflow
 from rxcli.calibrate.lens import Board, GrayImage, Rejected, calibrate_lens, find_boards
 from rxcli.calibrate.lensfun import lens_from_database
@@ -259,7 +259,7 @@ def shutter(
     if screen:
         result = calibrate_slots(chosen, load_profile(screen, ScreenProfile), along)
     else:
-        lights, tone_known = [light_of(frame) for frame in chosen], raw or chosen[0].linear
+        lights, tone_known = [frame_light(frame) for frame in chosen], raw or chosen[0].linear
         known_s = chosen[0].metadata.exposure_s if exposure_s is None else exposure_s
         result = calibrate_shutter(lights, frequencies, along, known_s, window, tone_known)  # type: ignore[arg-type]
     for warning in (*result.warnings, *result.doubts):

@@ -22,7 +22,7 @@ from rxcli.errors import ExitCode, UsageError, printable
 if TYPE_CHECKING:
     from rxcli.ingest.v4l2 import CameraCounts, CameraSettings, LiveSource
     from rxcli.outputs import Taken
-    from rxcli.results.aim import Aim, AimState, Light
+    from rxcli.results.aim import Aim, AimState, Brightness
     from rxcli.types import Frame, FrameResult, ObjectProgress
 
 #: How often the status is written: on a terminal over itself, elsewhere line by line.
@@ -159,7 +159,7 @@ class Status:
     #: Of the newest frame.
     state: AimState | None = None
     _aim: Aim | None = None
-    _light: Light | None = None
+    _light: Brightness | None = None
     _height: int = 1
     _bars: list[Any] = field(default_factory=list)
     _shown_s: float = 0.0
@@ -175,10 +175,10 @@ class Status:
 
     def watched(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """The frames, whose light and height are looked at as they pass."""
-        from rxcli.results.aim import light_of
+        from rxcli.results.aim import brightness_of
 
         for frame in frames:
-            self._light, self._height = light_of(frame), frame.height
+            self._light, self._height = brightness_of(frame), frame.height
             yield frame
 
     def update(self, result: FrameResult, files: Sequence[ObjectProgress] = ()) -> None:

@@ -180,11 +180,11 @@ def _check_page(page: Any, path: Path) -> None:
 
 def _jpeg_sizes(page: Any) -> Iterator[tuple[int, int]]:
     """Width and height of the JPEG pictures that the parts of a page are."""
-    from rxcli.ingest.jpeg import frame_of
+    from rxcli.ingest.jpeg import header_of
 
     for at, length in zip(page.dataoffsets, page.databytecounts, strict=False):
         page.parent.filehandle.seek(at)
-        yield frame_of(page.parent.filehandle.read(length))[:2]
+        yield header_of(page.parent.filehandle.read(length))[:2]
 
 
 def _tiff_luma(pixels: NDArray[Any], path: Path) -> tuple[Luma, bool]:

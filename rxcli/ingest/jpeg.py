@@ -51,7 +51,7 @@ def decode_luma(data: Any, source: object, at_once: int = 1) -> NDArray[np.uint8
         InputError: truncated (with the number of rows), damaged, or no JPEG.
     """
     data = bytes(data)
-    width, height, held, is_one_scan = frame_of(data)
+    width, height, held, is_one_scan = header_of(data)
     if not width:
         raise InputError(f"{source}: the JPEG header is damaged or cut", "copy the file again")
     check_size(source, width, height, at_once * held, at_once * len(data))
@@ -83,11 +83,11 @@ def colours_of(data: bytes) -> Colours:
     return Colours(
         lambda: as_shares(decoded(data, _EIGHTH)),
         lambda: luma_of(decoded(data, _WHOLE), without_red(BT601)),
-        first_rows if frame_of(data)[3] else None,
+        first_rows if header_of(data)[3] else None,
     )
 
 
-def frame_of(data: bytes) -> tuple[int, int, float, bool]:
+def header_of(data: bytes) -> tuple[int, int, float, bool]:
     """Width and height, bytes a pixel that decoding takes, and whether all of it is one scan; zeros without a scan.
 
     Luma, and the coefficients of all components where they come in several scans. ITU-T T.81, B.2.2: a frame's header

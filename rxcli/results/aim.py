@@ -36,7 +36,7 @@ _WORDS = {"no_screen": "no screen", "no_signal": "no signal", "unreadable": "no 
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
+class Brightness:
     """How bright a picture is."""
 
     #: Mean, 0..1 of the values between black and white.
@@ -52,14 +52,14 @@ class Light:
         return "overexposed" if self.clipped > _BRIGHT else "good"
 
 
-def light_of(frame: Frame) -> Light:
+def brightness_of(frame: Frame) -> Brightness:
     """How bright a picture is, from some thousand of its pixels; a clip's black and white are those of its format."""
     step = max(1, min(frame.width, frame.height) // 64)
     black, white = frame.black, frame.white
     if frame.mosaic is not None:
         black, white = float(np.mean(frame.mosaic.black)), frame.mosaic.white
     share = (frame.pixels[::step, ::step].astype(np.float32) - black) / max(white - black, 1.0)
-    return Light(float(np.clip(share, 0, 1).mean()), float(np.mean(share > 0.98)))
+    return Brightness(float(np.clip(share, 0, 1).mean()), float(np.mean(share > 0.98)))
 
 
 def height_share(corners: FloatArray | None, height: int) -> float | None:
@@ -83,7 +83,7 @@ class AimState:
     packets_per_s: float = 0.0
     bits_per_s: float = 0.0
     ber_hat: float | None = None
-    light: Light | None = None
+    light: Brightness | None = None
     height_share: float | None = None
     #: Why there is no lock, and what to do; with a lock, only of a hand that shakes and a screen partly out of view.
     reason: str = ""
@@ -99,7 +99,7 @@ class Aim:
     #: Of the last result.
     _corners: FloatArray | None = None
 
-    def update(self, result: FrameResult, now_s: float, height: int, light: Light | None = None) -> AimState:
+    def update(self, result: FrameResult, now_s: float, height: int, light: Brightness | None = None) -> AimState:
         """The state with one more result.
 
         Args:
@@ -155,7 +155,7 @@ class Aim:
         }
 
 
-def aiming_hint(result: FrameResult, light: Light | None = None) -> tuple[str, str]:
+def aiming_hint(result: FrameResult, light: Brightness | None = None) -> tuple[str, str]:
     """Why there is no lock, and the one thing to do next, for a person who holds the camera.
 
     Light comes first: in a picture that is too dark or overexposed, nothing else can be judged.

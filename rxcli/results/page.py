@@ -12,7 +12,7 @@ import numpy as np
 from rxcli.errors import printable
 from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.resources import data_dir
-from rxcli.results.aim import height_share, light_of, split_message
+from rxcli.results.aim import brightness_of, height_share, split_message
 from rxcli.results.columns import column_rows, packet_rows, text_rows
 from rxcli.results.inspection import Inspection, Trace, inspect_frame
 from rxcli.results.maps import column_map
@@ -94,7 +94,7 @@ def _facts(frame: Frame, result: FrameResult) -> dict[str, str]:
     share, delay_s = height_share(result.corners, frame.height), result.line_delay_s
     facts = {
         "Picture": f"{frame.width} x {frame.height}",
-        "Light": light_of(frame).word,
+        "Light": brightness_of(frame).word,
         "Screen": result.screen_profile or "not found",
         "Camera": result.camera_profile or ("estimated" if delay_s else "unknown"),
         "Screen fills of the height": None if share is None else f"{100 * share:.0f} %",

@@ -15,7 +15,7 @@ from typing import Any
 from rxcli.errors import ReceiverError, sentence, without_commands
 from rxcli.ingest.v4l2 import CameraSettings, LiveSource
 from rxcli.options import ReceiverOptions
-from rxcli.results.aim import Aim, AimState, light_of
+from rxcli.results.aim import Aim, AimState, brightness_of
 from rxcli.results.columns import packet_rows, text_rows
 from rxcli.runs.batch import Source, standard_decoder, use_one_thread
 from rxcli.runs.processes import start_process
@@ -127,7 +127,7 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
         result = replace(received, message=received.message and without_commands(received.message))
         now_s = time.monotonic()
         newest = watched.frame
-        height, light = (newest.height, light_of(newest)) if newest is not None else (1, None)
+        height, light = (newest.height, brightness_of(newest)) if newest is not None else (1, None)
         unsent = result, aim.update(result, now_s, height, light)
         packets.extend(packet_rows(result))
         texts += text_rows(result)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rxcli.calibrate.frames import light_of
+from rxcli.calibrate.frames import frame_light
 from rxcli.calibrate.periodic import fit_fundamental, fit_periodic
 from rxcli.calibrate.saving import profile_to_extend, with_mode, write_profile
 from rxcli.calibrate.shutter import calibrate_shutter, find_stripes
@@ -217,11 +217,11 @@ def test_light_undoes_tone_and_range_and_mixes_no_rows_of_a_mosaic() -> None:
     pixels = (1000 + 100 * rows).astype(np.uint16)
     pixels[::2, ::2] = 4000  # red pixels, which a red lamp would saturate
     frame = Frame(pixels, "x", mosaic=Mosaic(pattern, (2.0, 1.0, 1.5), (1000.0,) * 3, 5000.0))
-    np.testing.assert_allclose(light_of(frame), np.repeat(np.arange(8)[:, None] * 100 / 4000, 6, axis=1), rtol=1e-6)
+    np.testing.assert_allclose(frame_light(frame), np.repeat(np.arange(8)[:, None] * 100 / 4000, 6, axis=1), rtol=1e-6)
     frame = Frame(np.array([[16, 235, 126]], np.uint8), "x", black=16, white=235)
-    np.testing.assert_allclose(light_of(frame), [[0, 1, ((110 / 219 + 0.055) / 1.055) ** 2.4]], rtol=1e-5)
+    np.testing.assert_allclose(frame_light(frame), [[0, 1, ((110 / 219 + 0.055) / 1.055) ** 2.4]], rtol=1e-5)
     linear = Frame(np.array([[0, 128]], np.uint8), "x", linear=True)
-    np.testing.assert_allclose(light_of(linear), [[0, 128 / 255]], rtol=1e-5)
+    np.testing.assert_allclose(frame_light(linear), [[0, 128 / 255]], rtol=1e-5)
 
 
 def test_a_mode_replaces_that_of_its_size_and_keeps_the_rest(tmp_path: Path) -> None:

@@ -232,25 +232,19 @@ def test_a_single_frame_is_a_photograph(clip: Clip) -> None:
     assert all(p.burst is None and p.frames is None for p in packets)
 
 
-def test_another_scene_is_searched_anew(clip: Clip) -> None:
-    other = simulate(8, 8, "chelsea")
-    moved = tuple(replace(frame, index=6 + k, time_s=0.1 + frame.time_s) for k, frame in enumerate(other.frames))
-    got = list(receive((*clip.frames[:6], *moved), clip.options))
-    late = [replace(result, frame=result.frame - 6) for result in got[6:]]
-    _, score = scored(late, other.truth)
-    assert score.error_free >= 0.7 * score.expected
-    numbers = [p.burst for r in got for c in r.columns[:1] for p in c.packets if p.burst is not None]
-    assert numbers == sorted(numbers)
-
-
-def test_another_scene_while_frames_are_held_back(clip: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The frames held back are looked at again by their own picture, and leave that of the new scene alone."""
-    monkeypatch.setattr("rxcli.receiver.clip.ledger.SETTINGS", replace(SETTINGS, much_doubt=-1.0))
+@pytest.mark.parametrize(("much_doubt", "share"), [(SETTINGS.much_doubt, 0.7), (-1.0, 0.9)], ids=["plain", "in doubt"])
+def test_another_scene_is_searched_anew(
+    clip: Clip, monkeypatch: pytest.MonkeyPatch, much_doubt: float, share: float
+) -> None:
+    """Frames held back in doubt are looked at again by their own picture, and leave that of the new scene alone."""
+    monkeypatch.setattr("rxcli.receiver.clip.ledger.SETTINGS", replace(SETTINGS, much_doubt=much_doubt))
     other = simulate(8, 8, "chelsea")
     moved = tuple(replace(frame, index=6 + k, time_s=0.1 + frame.time_s) for k, frame in enumerate(other.frames))
     got = list(receive((*clip.frames[:6], *moved), clip.options))
     _, score = scored([replace(result, frame=result.frame - 6) for result in got[6:]], other.truth)
-    assert score.error_free >= 0.9 * score.expected
+    assert score.error_free >= share * score.expected
+    numbers = [p.burst for r in got for c in r.columns[:1] for p in c.packets if p.burst is not None]
+    assert numbers == sorted(numbers)
 
 
 def test_wrong_times_do_not_make_the_only_possible_screen_unsure(clip: Clip) -> None:

@@ -37,7 +37,7 @@ def burst_samples(
     mean = np.maximum(mean, np.float32(SETTINGS.min_level_sigmas * model.noise.sigma))
     light = np.asarray(above / mean, np.float32)
     ahead = np.diff(clock.delay_slots) * q if clock.delay_slots.any() else None
-    own = own_light(light) if lit is None else light_of(lit, clock.exposure_slots, q)
+    own = own_light(light) if lit is None else light_of_slots(lit, clock.exposure_slots, q)
     neighbours = model.crosstalk.from_neighbours(own, columns, ahead)
     light, mean, valid = light[columns], mean[columns], samples.valid[columns]
     variance = model.noise.variance(above[columns]) / np.square(mean)
@@ -79,7 +79,7 @@ def own_light(light: Float32Array) -> Float32Array:
     return np.asarray(np.clip(light[:, third : n_strips - third].mean(axis=1) / 2, 0, 1), np.float32)
 
 
-def light_of(lit: Float32Array, exposure_slots: float, samples_per_slot: int) -> Float32Array:
+def light_of_slots(lit: Float32Array, exposure_slots: float, samples_per_slot: int) -> Float32Array:
     """(C, N * Q) share of lit slots (C, N) in exposures by their start; 0.5 beyond the end."""
     taps = exposed_from(exposure_slots, samples_per_slot)
     padded = np.pad(lit, ((0, 0), (0, taps.shape[1] - 1)), constant_values=0.5)
