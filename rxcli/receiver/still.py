@@ -159,8 +159,7 @@ def slots_of_any_kind(acquisition: Acquisition, clocks: Sequence[Clock]) -> list
         samples = sync.sample_slots(profiles, clock, STILL.coarse_samples)
         model = _light_model(replace(acquisition, profiles=profiles), clock, samples)
         by_start = sync.sample_slots(profiles, ratios.by_start(clock), STILL.coarse_samples)
-        level, noise, crosstalk = model.black_level, model.noise, model.crosstalk
-        parts.append(ratios.burst_samples(by_start, clock, level, noise, crosstalk, columns))
+        parts.append(ratios.burst_samples(by_start, clock, model, columns))
     lit, evidence = survivors.detect_free(survivors.side_by_side(parts), QUICK_SURVIVORS)
     by_clock = evidence.reshape(len(clocks), -1).sum(axis=1).tolist()
     return list(zip(lit.reshape(len(clocks), columns.size, -1), by_clock, strict=True))

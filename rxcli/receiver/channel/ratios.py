@@ -20,7 +20,7 @@ def by_start(clock: Clock) -> Clock:
 
 
 def burst_samples(
-    samples: SlotSamples, clock: Clock, model: ObservationModel, columns: IntArray, lit: Float32Array | None
+    samples: SlotSamples, clock: Clock, model: ObservationModel, columns: IntArray, lit: Float32Array | None = None
 ) -> BurstSamples:
     """Samples of the bursts of some columns.
 
