@@ -8,7 +8,7 @@ import numpy as np
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.frame.acquisition import noise_of, variants_of
-from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.cache import FrameCache, key_of
 from rxcli.receiver.frame.camera import FrameCamera
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
@@ -116,9 +116,10 @@ class Proposer:
 
     def with_clock(self, hypothesis: Hypothesis) -> Hypothesis | None:
         """The hypothesis with its columns and its clock, or None if no header is found."""
-        profiles = self.context(hypothesis).sample_columns(hypothesis.screen.columns)
+        context = self.context(hypothesis)
+        profiles = context.sample_columns(hypothesis.screen.columns)
         with self.cache.timer("clock"):
-            clock = _clock(hypothesis, profiles)
+            clock = _clock(context, hypothesis.screen, profiles)
         # Through a long exposure headers stand out less, and evidence decides.
         is_long = clock is not None and clock.exposure_slots > LONG_EXPOSURE_SLOTS
         if clock is None or clock.header_peak_ratio < (1.0 if is_long else SETTINGS.min_lead):
@@ -187,9 +188,17 @@ def _by_clock(
     return {clock: groups[clock] for clock in sorted(groups) if groups[clock]}
 
 
-def _clock(hypothesis: Hypothesis, profiles: RowProfiles) -> Clock | None:
-    screen, camera = hypothesis.screen, hypothesis.camera
-    pooled = sync.binned_strips(profiles)
+def _clock(context: FrameContext, screen: ScreenProfile, profiles: RowProfiles) -> Clock | None:
+    """The clock of a hypothesis; sought once for all exposures that are not long, as it is the same."""
+    camera, corners = context.camera, context.sampled_corners
     rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
     exposure_slots = camera.exposure_s * screen.slot_rate_hz
-    return sync.find_clock(pooled, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(pooled))
+
+    def find() -> Clock | None:
+        pooled = sync.binned_strips(profiles)
+        return sync.find_clock(pooled, rows_per_slot, exposure_slots, screen.packet_slots, noise_of(pooled))
+
+    long_slots = exposure_slots if exposure_slots > LONG_EXPOSURE_SLOTS else None
+    place = corners.tobytes(), key_of(camera.lens), camera.tone, camera.reversed
+    clock = context.cache.once((*place, screen.columns, screen.packet_slots, rows_per_slot, long_slots), find)
+    return clock and replace(clock, exposure_slots=exposure_slots)
