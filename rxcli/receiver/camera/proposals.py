@@ -79,7 +79,8 @@ def propose(
         found = [clock for clock in found if clock.exposure_slots < LONG_EXPOSURE_SLOTS]
     short = _distinct(clock for clock in found if not any(_is_same(clock, better) for better in smeared))
     ranked = sorted(smeared + short, key=lambda clock: -clock.score)
-    return [replace(clock, number=number) for number, clock in enumerate(ranked)]
+    likely = [clock for clock in ranked if clock.score >= SETTINGS.min_score]
+    return [replace(clock, number=number) for number, clock in enumerate(likely or ranked[:1])]
 
 
 def propose_slots(strips: ColumnStrips, *, may_bend: bool = True) -> list[CameraHypothesis]:

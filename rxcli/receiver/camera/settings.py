@@ -41,9 +41,11 @@ class EstimateSettings:
     #: Strength of the slots' line that noise reaches in one of ten pictures, ln(10 * 2000 bins); bends it is sought on.
     min_slot_line: float = 9.9
     n_line_bends: int = 25
-    #: Clocks this close, relative, are one; and hypotheses that are proposed.
+    #: Clocks this close, relative, are one; hypotheses that are proposed; and the score that further ones need, as most
+    #: of noise have 30 to 45, and right ones 60 and more where a whole packet is in view.
     same_clock: float = 4e-3
     n_proposed: int = 5
+    min_score: float = 40.0
 
     #: Error of a period over the picture, slots: by the copies of packets, and by the line of a long exposure.
     period_error: tuple[float, float] = (0.25, 0.0625)

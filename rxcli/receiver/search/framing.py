@@ -86,16 +86,14 @@ def framing_of(
     is_plain = all(likeliest[1] - rival[1] > PASSES.plain_bursts for rival in rivals)
     if len(lengths) == 1 and is_plain and np.array_equal(likeliest[0].burst, own.burst):
         return Framing(prior, 1.0, np.ones(int(own.burst.max()) + 1))
-    exposed = _exposure_log_likelihood(context, acquisition, reception, screens)
-    log_weight = np.array(
-        [
-            _log_weight(reception, *framing) + exposed.get(length, 0.0)
-            for length, each in framings.items()
-            for framing in each
-        ]
-    )
+    log_weight = np.array([_log_weight(reception, *framing) for each in framings.values() for framing in each])
+    n_own = 1 + len(rivals)
+    odds = float(np.logaddexp.reduce(log_weight[:n_own]) - np.logaddexp.reduce(log_weight[n_own:]))
+    if abs(odds) < _MAX_LOG_ODDS - SETTINGS.min_exposure_llr:  # else no exposure outweighs what the slots show
+        exposed = _exposure_log_likelihood(context, acquisition, reception, screens)
+        log_weight += [exposed.get(length, 0.0) for length, each in framings.items() for _ in each]
     weight = np.exp(log_weight - log_weight.max())
-    of_ways = weight[: 1 + len(rivals)] / weight.sum()
+    of_ways = weight[:n_own] / weight.sum()
     ways = np.array([clock.burst for clock, _ in (likeliest, *rivals)])
     places = own.to_copies(np.ones(own.n_slots, bool))
     counts, bursts = places[:, PREAMBLE_SLOTS:].any(axis=1), np.zeros(int(own.burst.max()) + 1)

@@ -135,6 +135,8 @@ class _Walk:
         self._scored: list[Scored] = []
         self._tried: list[Tried] = []
         self._asked: set[tuple[object, ...]] = set()
+        #: Long exposures whose middle columns showed no packets.
+        self._n_in_vain = 0
         self._number = count()
         self._fresh: list[_Entry] = []
         self._siblings: list[_Entry] = []
@@ -241,6 +243,8 @@ class _Walk:
         best, acquisition = self._best(), _acquired(hypothesis)
         # Without packets an estimated camera is rejected, and joint detection takes long.
         is_costly = hypothesis.camera.hypothesis is not None and acquisition.clock.exposure_slots > LONG_EXPOSURE_SLOTS
+        if is_costly and self._n_in_vain >= SETTINGS.hopeless_long_budget:
+            return
         if (best is not None or is_costly) and hypothesis.screen.columns > SETTINGS.few_columns:
             half = self._measured(hypothesis, acquisition.of_columns(acquisition.middle_columns))
             min_score, min_evidence = -np.inf, SETTINGS.bail
@@ -250,6 +254,7 @@ class _Walk:
                 min_evidence = min(SETTINGS.bail, best.evidence)
             if half.score < min_score or half.evidence < min_evidence:
                 self._tried.append(Tried(hypothesis, half.evidence, half.score, "half"))
+                self._n_in_vain += is_costly and half.evidence < SETTINGS.bail
                 return
         scored = self._measured(hypothesis, acquisition)
         if scored.evidence > SETTINGS.bail:

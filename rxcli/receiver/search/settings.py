@@ -21,11 +21,12 @@ class SearchSettings:
     few_packets: float = 40.0
     plain_estimate: float = 100.0
     #: Maximum number of initial passes of a frame; if its columns do not stand out, if it shows no borders of columns,
-    #: and without any evidence.
+    #: and without any evidence: of all hypotheses, and of unknown cameras' long exposures, which take long.
     budget: int = 24
     doubtful_budget: int = 3
     borderless_budget: int = 12
     hopeless_budget: int = 8
+    hopeless_long_budget: int = 3
     #: Evidence of a screen without borders, times that of doubtful columns, from which it is taken instead.
     borderless_gain: float = 2.0
     #: Siblings of a scored hypothesis get a pass if their score could come this near to the best one.

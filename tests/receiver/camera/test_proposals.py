@@ -110,6 +110,13 @@ def test_unknown_phones_are_proposed_and_fitted(
         assert _bend_error_slots(estimated, corners, truth, upside_down) < 0.05
 
 
+def test_of_noise_one_camera_is_proposed() -> None:
+    noise = np.random.default_rng(1).integers(0, 256, (480, 640), np.uint8)
+    corners = np.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [0.0, 479.0]])
+    (proposed,) = blind.propose(strips_of(Frame(cv2.GaussianBlur(noise, (0, 0), 2), "noise"), corners), SCREENS)
+    assert proposed.score < SETTINGS.min_score
+
+
 @pytest.mark.parametrize("exposure_slots", [0.5, 1.2, 2.3])
 def test_an_exposure_that_no_file_states_is_proposed_by_the_width_of_the_stripes(exposure_slots: float) -> None:
     frame, corners, _ = phone("paper-17k3", 4.3, 960, exposure_slots=exposure_slots)

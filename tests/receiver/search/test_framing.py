@@ -39,6 +39,14 @@ def framed(
     return framing_of(acquisition, initial_pass(acquisition), possible, context)
 
 
+def estimate(rate_hz: float) -> tuple[FrameContext, FrameCamera]:
+    """A photograph by an estimated camera, whose file states an exposure of a slot of this rate."""
+    hypothesis = CameraHypothesis(ROWS_PER_SLOT, 70, False, np.zeros(4), 1.0, 0.0, 0.0, np.zeros(4), 0.05)
+    camera = FrameCamera(None, 1 / (ROWS_PER_SLOT * 8650), 1 / 8650, None, "srgb", hypothesis=hypothesis)
+    frame = Frame(np.zeros((4, 4), np.uint8), "photo", metadata=Metadata(exposure_s=1 / rate_hz))
+    return FrameContext(FrameCache(frame), np.zeros((4, 2)), camera, SCREENS), camera
+
+
 @pytest.mark.parametrize("sent", ["paper-8k65", "paper-17k3", "paper-34k6"])
 def test_one_header_in_view_leaves_the_length_open(sent: str) -> None:
     """Whatever was sent: the slots of the window are those of either screen."""
@@ -53,12 +61,14 @@ def test_the_exposure_that_a_file_states_speaks_for_a_slot_rate(
     rate_hz: float, low: float, high: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The light shows an exposure of a slot, the file that it lasts one of a screen's slot rate."""
-    hypothesis = CameraHypothesis(ROWS_PER_SLOT, 70, False, np.zeros(4), 1.0, 0.0, 0.0, np.zeros(4), 0.05)
-    camera = FrameCamera(None, 1 / (ROWS_PER_SLOT * 8650), 1 / 8650, None, "srgb", hypothesis=hypothesis)
-    frame = Frame(np.zeros((4, 4), np.uint8), "photo", metadata=Metadata(exposure_s=1 / rate_hz))
+    context, camera = estimate(rate_hz)
     monkeypatch.setattr(framing, "settle", lambda *_: (camera, 0.0))
-    context = FrameContext(FrameCache(frame), np.zeros((4, 2)), camera, SCREENS)
     assert low <= framed("paper-8k65", "paper-8k65", 520 - 30.0, 66, context=context).length <= high
+
+
+def test_no_exposure_is_fitted_where_slots_settle_the_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(framing, "settle", lambda *_: pytest.fail("an exposure was fitted"))
+    assert framed("paper-17k3", "paper-8k65", 520 - 2.0, 100, context=estimate(8650.0)[0]).length < 1e-4
 
 
 @pytest.mark.parametrize("n_slots", [78, 84, 100])

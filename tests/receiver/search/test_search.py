@@ -28,6 +28,7 @@ from rxcli.receiver.search.evidence import distinct_share
 from rxcli.receiver.search.numbers import less_likely_outlines
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.search import _Walk
+from rxcli.receiver.sync import clock as sync
 from rxcli.types import Frame, FrameResult
 
 SHIPPED = usual_screens()
@@ -150,9 +151,9 @@ def test_columns_with_packets_are_not_left_out_of_the_screen() -> None:
     assert max(one.log_odds for one in less_likely) < -3.0
 
 
-@pytest.mark.parametrize(("exposure_slots", "measured"), [(4.0, ["middle"]), (1.0, ["all"])])
-def test_a_long_exposure_is_measured_on_its_middle_columns_first(
-    exposure_slots: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("exposure_slots", "first", "n_measured"), [(4.0, "middle", 3), (1.0, "all", 9)])
+def test_long_exposures_are_measured_on_their_middle_columns_first_until_three_were_in_vain(
+    exposure_slots: float, first: str, n_measured: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock, own = SimpleNamespace(exposure_slots=exposure_slots), list[str]()
     middle = SimpleNamespace(part="middle")
@@ -165,8 +166,11 @@ def test_a_long_exposure_is_measured_on_its_middle_columns_first(
     monkeypatch.setitem(_Walk.run.__globals__, "_acquired", lambda _: acquisition)
     monkeypatch.setattr(_Walk, "_measured", measure)
     estimated: Any = SimpleNamespace(camera=SimpleNamespace(hypothesis=1), screen=SimpleNamespace(columns=20))
-    _Walk(Proposer(FrameCache(Frame(np.zeros((8, 8), np.uint8), "")), ReceiverOptions(), ()), 8)._score(estimated)
-    assert own == measured
+    walk = _Walk(Proposer(FrameCache(Frame(np.zeros((8, 8), np.uint8), "")), ReceiverOptions(), ()), 8)
+    for _ in range(5):
+        walk._score(estimated)
+    assert own[0] == first
+    assert len(own) == n_measured
 
 
 def test_every_hypothesis_is_recorded_with_its_fate(tmp_path: Path) -> None:
@@ -209,6 +213,24 @@ def test_the_budget_bounds_the_passes() -> None:
     found = search(FrameCache(trial.frame), replace(trial.options(), screens=SHIPPED), budget=1)
     assert isinstance(found, Found)
     assert len(found.tried) == 1
+
+
+@pytest.mark.parametrize(("exposure_slots", "n_sought"), [(1.5, 1), (3.0, 2)])
+def test_a_clock_is_sought_once_for_all_exposures_that_are_not_long(
+    exposure_slots: float, n_sought: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trial, sought = trial_of("paper-17k3"), list[float]()
+    find = sync.find_clock
+    monkeypatch.setattr(sync, "find_clock", lambda *given: sought.append(given[2]) or find(*given))
+    proposer = Proposer(FrameCache(trial.frame), trial.options(), (Outline(trial.corners),))
+    hypothesis = next(proposer.cameras())[0]
+    for exposure in (1.0, exposure_slots):
+        camera = replace(hypothesis.camera, exposure_s=exposure / hypothesis.screen.slot_rate_hz)
+        found = proposer.with_clock(replace(hypothesis, camera=camera))
+        assert found is not None
+        assert found.clock is not None
+        assert found.clock.exposure_slots == pytest.approx(exposure)
+    assert len(sought) == n_sought
 
 
 @pytest.mark.parametrize(("upright", "lean"), [(5.0, 0.5), (20.0, 0.0)])
