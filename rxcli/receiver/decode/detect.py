@@ -356,10 +356,15 @@ def plausible_weights(metrics: FloatArray, margin: float, llr: Float32Array | No
 
 
 def common_weights(w_log_prob: FloatArray) -> NDArray[np.bool_]:
-    """(C, 9) the weight of every column, from log probabilities (C, 9) of columns by themselves.
+    """(C, 9) the weight of every column, where it is known by the words alone; see `weight_shares`."""
+    common = SETTINGS.weight_temper * w_log_prob + np.log(weight_shares(w_log_prob))
+    return np.asarray(common == common.max(axis=1, keepdims=True))
 
-    Columns of most screens have the same weight, and where no dimming symbol is in view it is known by the words alone.
-    So the shares of all weights in the columns are the prior of each column.
+
+def weight_shares(w_log_prob: FloatArray) -> FloatArray:
+    """(9,) shares of the weights in all columns, from log probabilities (C, 9) of columns by themselves.
+
+    Columns of most screens have the same weight, so these are the prior of each column.
     """
     own = SETTINGS.weight_temper * w_log_prob
     shares = np.full(len(WEIGHTS), 1 / len(WEIGHTS))
@@ -368,4 +373,4 @@ def common_weights(w_log_prob: FloatArray) -> NDArray[np.bool_]:
         posterior = np.exp(posterior - np.logaddexp.reduce(posterior, axis=1, keepdims=True))
         shares = posterior.sum(axis=0) + SETTINGS.other_weights
         shares /= shares.sum()
-    return np.asarray(posterior == posterior.max(axis=1, keepdims=True))
+    return shares

@@ -29,7 +29,7 @@ from rxcli.protocol import (
     dimming_symbol,
     slot_patterns,
 )
-from rxcli.receiver.decode.detect import llr_of_bits, log_of_best, preamble_slots
+from rxcli.receiver.decode.detect import llr_of_bits, log_of_best, preamble_slots, weight_shares
 from rxcli.receiver.decode.settings import SURVIVORS, SurvivorSettings
 from rxcli.receiver.light import exposed_from
 from rxcli.types import BurstPosteriors, BurstSamples, Float32Array, FloatArray, IntArray
@@ -75,15 +75,21 @@ class _Paths:
         return _Paths(*(values.reshape(-1, *values.shape[2:]).take(place, axis=0) for values in every))
 
 
-def detect(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> BurstPosteriors:
-    """Posteriors of bursts from their samples; `header_llr` is 0."""
+def detect(
+    samples: BurstSamples, settings: SurvivorSettings = SURVIVORS, *, has_common_weights: bool = False
+) -> BurstPosteriors:
+    """Posteriors of bursts from their samples; `header_llr` is 0.
+
+    With `has_common_weights` the weights of all columns are the prior of each.
+    """
     n_bursts, n_columns = samples.n_bursts, samples.n_columns
     paths, steps, ends = _forward(samples, settings, is_free=False)
     words = _backward(steps, ends, np.zeros_like(paths.log_likelihood))
     # One weight for all bursts of a column.
     w_log_prob = _weight_log_prob(*words[0]).reshape(n_bursts, n_columns, -1).sum(axis=0)
     w_log_prob = w_log_prob - np.logaddexp.reduce(w_log_prob, axis=1, keepdims=True)
-    w = w_log_prob.argmax(axis=1) + 1
+    common = np.log(weight_shares(w_log_prob)) if has_common_weights else 0.0
+    w = (w_log_prob + common).argmax(axis=1) + 1
     shape = (n_bursts, n_columns, len(words))
     lit = np.empty((n_bursts, n_columns, samples.light.shape[0]), np.float32)
     index, log_prob = np.zeros(shape, np.int64), np.zeros(shape)

@@ -239,7 +239,7 @@ def test_shipped_models_make_the_words_that_were_sent_likelier(name: str) -> Non
         fed = {part: getattr(sample, part).astype(np.float32) for part in ("strips", "columns")}
         corrections = session.run(["correction"], fed)[0]
         sums += [cross_entropy(sample, values) for values in (corrections, np.zeros_like(corrections))]
-    assert sums[0] <= 0.93 * sums[1], sums[0] / sums[1]
+    assert sums[0] <= 0.95 * sums[1], sums[0] / sums[1]
 
 
 def test_slots_that_are_not_seen_and_preambles_are_left_alone(scene: DenoiserInput) -> None:

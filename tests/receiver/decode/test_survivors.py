@@ -126,6 +126,16 @@ def test_a_symbol_that_nothing_shows_is_open() -> None:
     assert found.log_prob[0, :, 2:].max() < np.log(0.2)
 
 
+def test_a_column_that_leaves_its_weight_open_has_that_of_all() -> None:
+    rng = np.random.default_rng(11)
+    weights = [7, 7, 7, 7, 7, 3]
+    sent = [packet(rng.integers(0, 1 << bits_per_symbol(w), 4), w) for w in weights]
+    burst = samples(sent, 2.0, rng, 0.01, 0.02)
+    burst.noise[:, :, 1] = 4
+    assert detect(burst).w[1] != 7
+    assert detect(burst, has_common_weights=True).w.tolist() == weights
+
+
 def test_few_paths_are_enough_and_packets_beat_arbitrary_slots() -> None:
     rng = np.random.default_rng(10)
     index = rng.integers(0, 128, (4, 5))
