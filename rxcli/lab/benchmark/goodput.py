@@ -26,6 +26,9 @@ _W = 5
 _MAX_LLR = 9.0
 #: Latest start of clips after an object's start, seconds; and their maximum length relative to the required one.
 _START_WITHIN_S, _MAX_TIMES = 900.0, 6.0
+#: What the required length allows for besides the data: head and name of a file, bytes, and its announcement, seconds;
+#: and frames that every clip may have besides.
+_HEAD_BYTES, _ANNOUNCED_S, _FURTHER_FRAMES = 200, 0.5, 40
 
 
 def snr_db_of(picture: str, columns: int) -> FloatArray:
@@ -59,10 +62,10 @@ def transferred(
     receiver = LinkReceiver(profile.columns, profile.payload_symbols)
     start_s, readout_s = float(rng.uniform(0, _START_WITHIN_S)), readout / frame_rate_hz
     burst_s, burst_bits = profile.packet_s * profile.repeats, bits_per_symbol(_W) * int(np.isfinite(snr_db).sum())
-    needed_s = 8 * (size + 200) / (burst_bits * profile.payload_symbols / burst_s * readout) + 0.5
+    needed_s = 8 * (size + _HEAD_BYTES) / (burst_bits * profile.payload_symbols / burst_s * readout) + _ANNOUNCED_S
     visible, cpu_s = 0, 0.0
     came: dict[str, Any] = {"exact": False, "seconds": 0.0}
-    for frame in range(ceil(_MAX_TIMES * needed_s * frame_rate_hz) + 40):
+    for frame in range(ceil(_MAX_TIMES * needed_s * frame_rate_hz) + _FURTHER_FRAMES):
         begin_s = start_s + frame / frame_rate_hz
         bursts = np.arange(int(begin_s / burst_s), int((begin_s + readout_s) / burst_s) + 1)
         observed = _observed(bursts, begin_s, begin_s + readout_s, profile)

@@ -213,21 +213,22 @@ class _Checkpoint:
     parts: tuple[Any, ...]
 
     @property
-    def _fit(self) -> str:
+    def _key(self) -> str:
+        """What a stored state must be of, to be restored."""
         return f"{self.recipe} {self.n_samples} samples"
 
     def save(self, history: list[tuple[int, float, float]]) -> None:
         """Write the state of all parts, and the losses so far."""
         self.folder.mkdir(parents=True, exist_ok=True)
         part = self.folder / "checkpoint.part"
-        torch.save({"fit": self._fit, "history": history, "parts": [each.state_dict() for each in self.parts]}, part)
+        torch.save({"fit": self._key, "history": history, "parts": [each.state_dict() for each in self.parts]}, part)
         part.replace(self.folder / "checkpoint.pt")
 
     def restore(self) -> list[tuple[int, float, float]]:
         """Restore the parts; return the losses so far, none if the folder has no checkpoint of this fit."""
         path = self.folder / "checkpoint.pt"
         stored = torch.load(path, weights_only=True) if path.exists() else {}
-        if stored.get("fit") != self._fit:
+        if stored.get("fit") != self._key:
             return []
         for part, state in zip(self.parts, stored["parts"], strict=True):
             part.load_state_dict(state)
