@@ -25,9 +25,10 @@ from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.attempts import receive_either_way
 from rxcli.receiver.search.cameras import UNKNOWN, known_camera
 from rxcli.receiver.search.cut import cut_packets
+from rxcli.receiver.search.evidence import USUAL_COLUMNS
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.outlines import no_screen, proposed_screens, too_small
-from rxcli.receiver.search.propose import USUAL_COLUMNS, nearest_screen
+from rxcli.receiver.search.propose import nearest_screen
 from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
 from rxcli.receiver.sync import clock as sync

@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import NORMAL_MEDIAN
 from rxcli.types import Float32Array, FloatArray, LightPlane, Outlines, RowProfiles
 
 #: Width of a strip in pixels from which a column is divided further, and maximum number of strips of a column.
@@ -136,8 +137,8 @@ def _noise_model(plane: LightPlane, sums: Float32Array, part_px: int, tone: str)
     # Bins of equal counts; the few brightest samples left over do not matter.
     bins = np.argsort(light)[: light.size // n_bins * n_bins].reshape(n_bins, -1)
     x = np.median(light[bins], axis=1)
-    # For a normal difference of two parts of variance s2: median |d| = 0.6745 sqrt(2 s2).
-    y = np.median(difference[bins], axis=1) ** 2 / (2 * 0.6745**2)
+    # For a normal difference of two parts of variance s2: median |d| = NORMAL_MEDIAN sqrt(2 s2).
+    y = np.median(difference[bins], axis=1) ** 2 / (2 * NORMAL_MEDIAN**2)
     return _floor_and_slope(x, part_px * y)
 
 

@@ -7,8 +7,8 @@ from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.search.hypothesis import Scored
 from rxcli.receiver.search.settings import SETTINGS
 
-#: Columns of the screen that evidence is scaled to: narrower columns show the same light several times.
-_COLUMNS = 20
+#: Columns of most screens. Evidence is scaled to them: narrower columns show the same light several times.
+USUAL_COLUMNS = 20
 
 
 def log_evidence(reception: Reception) -> float:
@@ -18,13 +18,13 @@ def log_evidence(reception: Reception) -> float:
     """
     llr = reception.column_llr
     headers = max(float(reception.posteriors.header_llr.sum()), 0.0)
-    return _COLUMNS / llr.size * (float(np.logaddexp(llr, 0.0).sum()) + SETTINGS.header_weight * headers)
+    return USUAL_COLUMNS / llr.size * (float(np.logaddexp(llr, 0.0).sum()) + SETTINGS.header_weight * headers)
 
 
 def fit(reception: Reception) -> float:
     """How well packets fit, for clocks whose slots are the same: in poor light all columns together show the start."""
     llr = reception.column_llr
-    return _COLUMNS / llr.size * float(np.maximum(llr, SETTINGS.worst_fit).sum())
+    return USUAL_COLUMNS / llr.size * float(np.maximum(llr, SETTINGS.worst_fit).sum())
 
 
 def score(reception: Reception, evidence: float, log_prior: float) -> float:

@@ -15,13 +15,11 @@ from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search.cameras import known_camera, propose_cameras, relabelled_camera
+from rxcli.receiver.search.evidence import USUAL_COLUMNS
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Clock, RowProfiles
-
-#: Number of columns on which a clock is sought first, or the nearest available number.
-USUAL_COLUMNS = 20
 
 
 @dataclass(frozen=True, slots=True)
