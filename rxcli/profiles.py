@@ -160,15 +160,6 @@ _Profile = TypeVar("_Profile", ScreenProfile, CameraProfile)
 _KINDS: dict[type[Any], str] = {ScreenProfile: "screens", CameraProfile: "cameras"}
 
 
-def parse_profile(text: str, kind: type[_Profile], source: str) -> _Profile:
-    """Parse and check one profile; `source` names it in messages.
-
-    Raises:
-        ProfileError: no TOML, an unknown key, or an impossible value.
-    """
-    return check_profile(_parsed(text, source), kind, source)
-
-
 def _parsed(text: str, source: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)

@@ -1,5 +1,6 @@
 """Pictures of unknown cameras from end to end."""
 
+import tomllib
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import ScreenProfile, load_profile, parse_profile
+from rxcli.profiles import ScreenProfile, check_profile, load_profile
 from rxcli.receiver import camera as blind
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Failure
@@ -27,7 +28,7 @@ from rxcli.types import Frame, Metadata
 
 CORNERS = np.array([[LEFT, TOP], [RIGHT, TOP], [RIGHT, BOTTOM], [LEFT, BOTTOM]], float)
 OPTIONS = ReceiverOptions(
-    screens=(parse_profile(SCREEN, ScreenProfile, "small"),), cameras=(), corners=CORNERS, cae="never"
+    screens=(check_profile(tomllib.loads(SCREEN), ScreenProfile, "small"),), cameras=(), corners=CORNERS, cae="never"
 )
 
 

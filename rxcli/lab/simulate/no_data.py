@@ -37,7 +37,7 @@ class _Light:
 
 
 def no_data_scene(kind: str, rng: Generator, n_frames: int = 1) -> tuple[Scene, dict[str, float]]:
-    """A scene of one of `NO_DATA_KINDS`, and what was drawn.
+    """A scene of one of `_KINDS`, and what was drawn.
 
     Args:
         kind: which.
@@ -196,5 +196,3 @@ _KINDS: dict[str, tuple[Callable[[Generator], FloatArray], Callable[[Generator],
 STRIPED_KINDS = ("pwm", "pwm textured", "pwm dark", "lamp", "codes", "blinds", "keyboard", "moire")
 _SHARES = (0.22, 0.18, 0.14, 0.14, 0.14, 0.06, 0.06, 0.06)
 EVEN_KINDS = ("photo", "screen", "noise")
-#: Kinds that `no_data_scene` knows.
-NO_DATA_KINDS = tuple(_KINDS)

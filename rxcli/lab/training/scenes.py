@@ -11,7 +11,6 @@ from rxcli.lab.simulate.scenes import Scene, preset
 
 #: scikit-image's pictures that training may use; the others are for validation.
 TRAINING_PHOTOS = ("camera", "coins", "hubble", "moon", "page", "retina")
-VALIDATION_PICTURES = ("astronaut", "chelsea", "coffee", "motorcycle", "rocket", "flower", "sky", "text", "night")
 #: Dark pictures that are drawn without a photograph.
 _DRAWN_DARK = ("terminal", "night", "stars")
 #: Shares of parts of photographs and of scattered shapes among the pictures; the others are dark ones.

@@ -1,5 +1,6 @@
 """Hypotheses of unknown cameras against cameras that are known, and the reasons where nothing can be estimated."""
 
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from rxcli.lab.simulate.optics import Pose
 from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, load_profile, parse_profile, usual_screens
+from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, dump_profile, load_profile, usual_screens
 from rxcli.receiver import camera as blind
 from rxcli.receiver import plane
 from rxcli.receiver.camera.proposals import stripe_rows
@@ -197,7 +198,7 @@ def test_an_estimate_can_be_kept_as_a_profile() -> None:
     estimated = blind.summary(hypothesis, 17300.0)
     assert estimated["line_delay_s"] == pytest.approx((1 / (5 * 17300), 0.001 / 5 / (5 * 17300)))
     profile = blind.camera_profile(estimated, "mine", "Maker", "Phone X", 4032, 3024)
-    again = parse_profile(dump_profile(profile), CameraProfile, "mine")
+    again = check_profile(tomllib.loads(dump_profile(profile)), CameraProfile, "mine")
     assert again == profile
     assert again.matches("maker", "phone x")
     mode = again.mode_for(4032, 3024)

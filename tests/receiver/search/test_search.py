@@ -1,5 +1,6 @@
 """The search: one answer in whatever order hypotheses come, screens as hypotheses, a record of what was tried."""
 
+import tomllib
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import lru_cache
@@ -16,7 +17,7 @@ from rxcli.ingest import open_source
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import CameraProfile, ScreenProfile, parse_profile, usual_screens
+from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, usual_screens
 from rxcli.receiver import camera as blind
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Failure
@@ -176,7 +177,8 @@ def test_long_exposures_are_measured_on_their_middle_columns_first_until_three_w
 def test_every_hypothesis_is_recorded_with_its_fate(tmp_path: Path) -> None:
     write_frame(tmp_path / "small.png", 5)
     frame = next(iter(open_source(str(tmp_path / "small.png"))))
-    screen, camera = parse_profile(SCREEN, ScreenProfile, "small"), parse_profile(CAMERA, CameraProfile, "camera")
+    screen = check_profile(tomllib.loads(SCREEN), ScreenProfile, "small")
+    camera = check_profile(tomllib.loads(CAMERA), CameraProfile, "camera")
     corners = np.array([[10, 10], [329, 10], [329, 609], [10, 609]], float)
     options = ReceiverOptions(
         screens=(screen, *SHIPPED), cameras=(camera,), force_camera=True, corners=corners, cae="never"
@@ -197,7 +199,7 @@ def test_a_refusal_says_what_came_nearest() -> None:
     rng = np.random.default_rng(2)
     frame = Frame(rng.integers(90, 110, (620, 340), np.uint8), "noise")
     corners = np.array([[10, 10], [329, 10], [329, 609], [10, 609]], float)
-    camera = parse_profile(CAMERA, CameraProfile, "camera")
+    camera = check_profile(tomllib.loads(CAMERA), CameraProfile, "camera")
     found = search(FrameCache(frame), ReceiverOptions(cameras=(camera,), force_camera=True, corners=corners))
     if isinstance(found, Found):
         assert found.best.evidence < 40
