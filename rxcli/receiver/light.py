@@ -314,16 +314,16 @@ def slot_llr(metrics: FloatArray, lit: Float32Array | None = None) -> Float32Arr
     isi_memory = int(metrics.shape[-1]).bit_length() - 2
     n_slots = metrics.shape[-2] - isi_memory
     by_age = _lit_by_age(isi_memory)
-    odds = np.zeros(1, np.float32)
+    log_odds = np.zeros(1, np.float32)
     if lit is not None:
         beyond = [(0, 0)] * (lit.ndim - 1) + [(isi_memory, isi_memory)]
-        prior = np.pad(np.log(lit) - np.log1p(-lit), beyond)
-        odds = np.lib.stride_tricks.sliding_window_view(prior, isi_memory + 1, axis=-1)[..., ::-1]
-        metrics = metrics + odds @ by_age.T
+        prior_llr = np.pad(np.log(lit) - np.log1p(-lit), beyond)
+        log_odds = np.lib.stride_tricks.sliding_window_view(prior_llr, isi_memory + 1, axis=-1)[..., ::-1]
+        metrics = metrics + log_odds @ by_age.T
     # Much faster than the maximum over the last axis, which is short.
     top = np.ascontiguousarray(np.moveaxis(metrics, -1, 0)).max(axis=0)
     likelihood = np.exp((metrics - top[..., None]).astype(np.float32))
-    gained = np.log(likelihood @ by_age + MIN_FLOAT32) - np.log(likelihood @ (1 - by_age) + MIN_FLOAT32) - odds
+    gained = np.log(likelihood @ by_age + MIN_FLOAT32) - np.log(likelihood @ (1 - by_age) + MIN_FLOAT32) - log_odds
     return np.asarray(sum(gained[..., age : age + n_slots, age] for age in range(isi_memory + 1)), np.float32)
 
 

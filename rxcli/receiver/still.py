@@ -229,8 +229,8 @@ def _joint_samples(
 
 def _with_weights(bursts: BurstSamples, w_log_prob: FloatArray, least: FloatArray) -> BurstSamples:
     """Bursts whose paths begin with the weights' log probability (C, 9), by burst and column no less than `least`."""
-    prior = np.maximum(w_log_prob, least) / bursts.n_bursts
-    return replace(bursts, w_log_prior=prior.reshape(-1, len(WEIGHTS)))
+    log_prior = np.maximum(w_log_prob, least) / bursts.n_bursts
+    return replace(bursts, w_log_prior=log_prior.reshape(-1, len(WEIGHTS)))
 
 
 def lateness(acquisition: Acquisition, model: channel.ObservationModel, w_log_prob: FloatArray, step: float) -> float:

@@ -291,9 +291,9 @@ def free_log_evidence(metrics: FloatArray, share: FloatArray) -> FloatArray:
         share: (C,) probability that a slot is lit.
     """
     n_columns, _, n_patterns = metrics.shape
-    prior = np.log(np.stack([1 - share, share], axis=1))
+    log_prior = np.log(np.stack([1 - share, share], axis=1))
     # A pattern is the state (the slots before) and the slot itself; the next state drops the oldest slot.
-    by_slot, tops = _over_likeliest(metrics.swapaxes(0, 1) + np.tile(prior, n_patterns // 2))
+    by_slot, tops = _over_likeliest(metrics.swapaxes(0, 1) + np.tile(log_prior, n_patterns // 2))
     steps = np.maximum(by_slot, _MIN_LIKELIHOOD).reshape(-1, n_columns, 2, n_patterns // 4, 2)
     log_evidence = tops[..., 0].sum(axis=0)
     state = np.full((n_columns, n_patterns // 2), 2 / n_patterns)

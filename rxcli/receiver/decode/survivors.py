@@ -123,8 +123,8 @@ def side_by_side(parts: Sequence[BurstSamples]) -> BurstSamples:
         for name in ("light", "noise", "valid", "neighbours")
     }
     log_scale = np.concatenate([part.log_scale for part in parts])
-    priors = [part.w_log_prior for part in parts if part.w_log_prior is not None]
-    joined["w_log_prior"] = np.concatenate(priors) if priors else None
+    log_priors = [part.w_log_prior for part in parts if part.w_log_prior is not None]
+    joined["w_log_prior"] = np.concatenate(log_priors) if log_priors else None
     return replace(parts[0], **joined, log_scale=log_scale, n_bursts=len(parts) * parts[0].n_bursts)
 
 
