@@ -1,6 +1,7 @@
-"""The outline of a bright screen in a dark room, from brightness alone.
+"""The outline of a screen in a dark room, from brightness alone.
 
 A checkerboard or a page of text shown on the screen hides the borders of the columns, but not the screen's four sides.
+Round dark pictures they still show faintly: a dark panel passes a little light, and reflects the room's.
 """
 
 import numpy as np
@@ -17,8 +18,11 @@ _MIN_PICTURE, _MIN_FILL = 0.08, 0.93
 _STRAIGHT, _MAX_TURN = 1.5, 0.25
 #: Distance from the picture's edge, in such pixels, within which a side may be the picture's; maximum number of those.
 _AT_EDGE, _MAX_HIDDEN = 2.0, 1
-#: The clearest grey level.
-_WHITE = 255
+#: The clearest grey level, and the share of a picture's parts at each end of its range.
+_WHITE, _TAIL = 255, 0.5
+#: Of faint parts: levels that are tried, each among what is below the last; cells across and down that are averaged;
+#: width of gaps that are filled, so that a screen's dark frame stays; step of the cells by which a level is found.
+_LEVELS, _AVERAGED, _GAP, _SAMPLED = 4, (5, 13), 9, 5
 #: Of stripes: rows of the mean that they are taken against, bands of rows and cells side by side in which they are
 #: compared, minimum correlation there, and minimum amplitude, of 255 as the clearest.
 _STRIPE_ROWS, _BANDS, _NEAR, _MIN_LIKENESS, _STRIPED = 129, 25, 5, 0.5, 80
@@ -26,10 +30,31 @@ _STRIPE_ROWS, _BANDS, _NEAR, _MIN_LIKENESS, _STRIPED = 129, 25, 5, 0.5, 80
 
 def bright_quadrilateral(plane: LightPlane) -> FloatArray | None:
     """Corners (4, 2) of the only bright part of a picture, pixels, clockwise from its top left; None if it has none."""
+    light, pixels = _cells(plane)
+    return _quadrilateral(_grey(_reduced(light, pixels)), pixels)
+
+
+def faint_quadrilaterals(plane: LightPlane) -> list[FloatArray]:
+    """The same of the parts above several levels, brightest first: a window, the film around it, the dark screen."""
     import cv2
 
     light, pixels = _cells(plane)
-    hull, shape = _hull(light, pixels)
+    small = cv2.blur(_reduced(light, pixels), _AVERAGED)
+    found, rest = [], small[::_SAMPLED, ::_SAMPLED].reshape(-1, 1)
+    for _ in range(_LEVELS):
+        low, high = np.percentile(rest, (_TAIL, 100 - _TAIL))
+        scale = _WHITE / max(float(high - low), TINY)
+        level, _ = cv2.threshold(_bytes((rest - low) * scale), 0, _WHITE, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+        found.append(_quadrilateral(_bytes((small - low) * scale), pixels, int(level), _GAP))
+        rest = rest[rest <= low + level / scale].reshape(-1, 1)
+    return [corners for corners in found if corners is not None]
+
+
+def _quadrilateral(grey: NDArray[np.uint8], pixels: int, threshold: int = 0, gap: int = _FILLED) -> FloatArray | None:
+    """Corners (4, 2) of the largest bright part of a reduced picture, if it is a quadrilateral; None otherwise."""
+    import cv2
+
+    hull, shape = _hull(grey, threshold, gap), grey.shape
     polygon = cv2.approxPolyDP(hull, _STRAIGHT, True).reshape(-1, 2).astype(np.float64)
     sides = _longest_sides(polygon)
     if sides is None or cv2.contourArea(hull) < _MIN_PICTURE * shape[0] * shape[1]:
@@ -56,7 +81,7 @@ def striped_box(plane: LightPlane) -> FloatArray | None:
     power, total = (cv2.blur(stripes[2:] * rest, near) for rest in (stripes[:-2], stripes[2:]))
     if not (power > _MIN_LIKENESS * total).any():
         return None
-    hull, _ = _hull(np.sqrt(np.maximum(power, 0)), pixels, _STRIPED)
+    hull = _hull(_grey(_reduced(np.sqrt(np.maximum(power, 0)), pixels)), _STRIPED)
     (left, top), (right, bottom) = hull.min(axis=(0, 1)) - _FILLED, hull.max(axis=(0, 1)) - _FILLED + 1
     return np.array([[left, top], [right, top], [right, bottom], [left, bottom]]) * float(pixels) - 0.5
 
@@ -67,21 +92,41 @@ def _cells(plane: LightPlane) -> tuple[Float32Array, int]:
     return np.diff(plane.sums[::cells], axis=0), cells * plane.cell_px
 
 
-def _hull(cells: Float32Array, pixels: int, threshold: int = 0) -> tuple[NDArray[np.int32], tuple[int, ...]]:
-    """Hull (n, 1, 2) of the largest bright part of some cells (n, rows), shifted by a border of `_FILLED`; and the
-    height and width of the reduced picture. A threshold of 0 is chosen by the picture.
+def _reduced(cells: Float32Array, pixels: int) -> Float32Array:
+    """A picture (h, w) of about `_WIDTH` square parts across, from cells (w, rows) of `pixels` width."""
+    import cv2
+
+    size = max(cells.shape[1] // pixels, 1), len(cells)
+    return np.asarray(cv2.resize(cells, size, interpolation=cv2.INTER_AREA).T, np.float32)
+
+
+def _bytes(values: Float32Array) -> NDArray[np.uint8]:
+    return np.clip(values, 0, _WHITE).astype(np.uint8)
+
+
+def _grey(small: Float32Array) -> NDArray[np.uint8]:
+    """Grey levels of a reduced picture, 0 to its brightest hundredth."""
+    return _bytes(small * np.float32(_WHITE / max(float(np.percentile(small, 99)), TINY)))
+
+
+def _hull(grey: NDArray[np.uint8], threshold: int = 0, gap: int = _FILLED) -> NDArray[np.int32]:
+    """Hull (n, 1, 2) of the largest bright part of a reduced picture, shifted by a border of `_FILLED`.
+
+    Args:
+        grey: the picture.
+        threshold: grey level; 0: chosen by the picture.
+        gap: width of dark parts that are filled.
     """
     import cv2
 
-    small = cv2.resize(cells, (max(cells.shape[1] // pixels, 1), len(cells)), interpolation=cv2.INTER_AREA).T
-    small = np.clip(small * np.float32(_WHITE / max(float(np.percentile(small, 99)), TINY)), 0, _WHITE).astype(np.uint8)
     method = cv2.THRESH_BINARY if threshold else cv2.THRESH_OTSU
-    _, bright = cv2.threshold(small, threshold, _WHITE, method)
+    _, bright = cv2.threshold(grey, threshold, _WHITE, method)
     padded = cv2.copyMakeBorder(bright, _FILLED, _FILLED, _FILLED, _FILLED, cv2.BORDER_CONSTANT, value=0)
-    padded = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((_FILLED, _FILLED), np.uint8))
+    padded = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8))
     contours, _ = cv2.findContours(padded, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    largest = max(contours, key=cv2.contourArea) if contours else _FILLED + np.array([[[0, 0]], [small.shape[::-1]]])
-    return cv2.convexHull(np.asarray(largest, np.int32)), small.shape
+    whole = _FILLED + np.array([[[0, 0]], [grey.shape[::-1]]])
+    largest = max(contours, key=cv2.contourArea) if contours else whole
+    return np.asarray(cv2.convexHull(np.asarray(largest, np.int32)), np.int32)
 
 
 def _longest_sides(polygon: FloatArray) -> FloatArray | None:

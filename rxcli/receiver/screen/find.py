@@ -39,6 +39,8 @@ _PLAIN_CONTRAST, _N_FITTED = 0.22, 3
 #: Weights of the light that a grid explains and of its perspective in its score, against 1 for its contrast: fitted to
 #: the grids of 186 simulated scenes, one in four of a night, such that no bright one loses its own.
 _BY_EXPLAINED, _BY_PERSPECTIVE = 7.0, -1.0
+#: Score by which grids between the sides of a bright part are ahead of those of combs.
+_OF_PART = 0.4
 #: Contrast of one screen's grid, as a share of that of two, from which there is one: over two it has that of one alone.
 _ONE_SCREEN = 0.9
 #: Contrast, times what chance gives, from which packets are looked for; of a part of a picture it must be plainer.
@@ -71,7 +73,7 @@ class ColumnLayout:
 
 
 def find_screens(
-    plane: LightPlane, layouts: Sequence[ColumnLayout], lens: Lens | None = None, bright: FloatArray | None = None
+    plane: LightPlane, layouts: Sequence[ColumnLayout], lens: Lens | None = None, parts: Sequence[FloatArray] = ()
 ) -> list[list[Outline]]:
     """Candidate outlines of each screen in a picture, likeliest first; the clearest screen comes first.
 
@@ -79,8 +81,7 @@ def find_screens(
         plane: of the picture.
         layouts: that the screen may have.
         lens: of the picture, if known.
-        bright: corners (4, 2) of the bright part of the picture, clockwise from its top left, where borders of columns
-            are looked for as well.
+        parts: corners (4, 2) of bright parts of the picture, clockwise from the top left: one may be the screen.
     """
     strips = _strips_of(plane, lens)
     if strips is None:
@@ -93,13 +94,13 @@ def find_screens(
         fine = read_strips(plane, lens, n_parts=_PARTS)
         grid = narrow_grid(fine, narrow[0].sigma)
         if grid is not None:
-            return [_numbered(fine, grid, narrow)]
+            return [_numbered(fine, grid, narrow, parts)]
     if not wide:
         return []
     size = (plane.width, plane.height)
-    rivals = [] if bright is None else [grid_between(bright, wide[0].n_columns, size, lens)]
+    rivals = [grid_between(corners, wide[0].n_columns, size, lens) for corners in parts]
     grids = wide_grids(strips, wide[0].sigma, rivals, _POSSIBLE_CONTRAST)
-    found = [candidate for rank, grid in enumerate(grids) for candidate in _numbered(strips, grid, wide, rank)]
+    found = [candidate for rank, grid in enumerate(grids) for candidate in _numbered(strips, grid, wide, parts, rank)]
     return [sorted(found, key=lambda candidate: -candidate.log_odds)] if found else []
 
 
@@ -203,15 +204,20 @@ def wide_grids(strips: PictureStrips, sigma: float, rivals: Sequence[Grid] = (),
         # Contrast needs borders that are in their place already.
         starts = sorted(starts, key=_likelihood, reverse=True)[:_N_FITTED]
         starts += [rival for rival in rivals if with_light(some, rival, sigma).contrast > 0]
+    # A part of the picture with four straight sides is mostly the screen where its borders stand out nearly as well.
+    ahead = [_OF_PART * any(grid is rival for rival in rivals) for grid in starts]
     near = [moved_by_waveforms(some, grid, sigma, _FIRST_STEPS) for grid in starts]
     fitted = [with_light(strips, moved_by_waveforms(strips, grid, sigma, _LAST_STEPS), sigma) for grid in near]
-    found = sorted((grid for grid in fitted if _stands_out(strips, grid, least)), key=_score, reverse=True)
-    if not found:
+    scored = [(_score(grid) + more, more, grid) for grid, more in zip(fitted, ahead, strict=True)]
+    scored = sorted((own for own in scored if _stands_out(strips, own[2], least)), key=lambda own: -own[0])
+    if not scored:
         return []
-    # Of grids with the same columns the likeliest is nearest to them.
-    best = max((grid for grid in found if not _differ(strips, grid, found[0])), key=_likelihood)
-    second = next((grid for grid in found if _differ(strips, grid, found[0])), None)
-    return [best] if second is None or _score(second) < _score(found[0]) - _NEARLY_BEST else [best, second]
+    score, _, likeliest = scored[0]
+    # Of grids with the same columns, that of a part, then the likeliest is nearest to them.
+    same = [(more, _likelihood(grid), grid) for _, more, grid in scored if not _differ(strips, grid, likeliest)]
+    best = max(same, key=lambda own: own[:2])[2]
+    second = [grid for own, _, grid in scored if own >= score - _NEARLY_BEST and _differ(strips, grid, likeliest)]
+    return [best, *second[:1]]
 
 
 def _likelihood(grid: Grid) -> float:
@@ -270,9 +276,15 @@ def _stands_out(strips: PictureStrips, grid: Grid, least: float = 1.0) -> bool:
     return bool(grid.contrast > least * by_chance)
 
 
-def _numbered(strips: PictureStrips, grid: Grid, layouts: Sequence[ColumnLayout], rank: int = 0) -> list[Outline]:
+def _numbered(
+    strips: PictureStrips,
+    grid: Grid,
+    layouts: Sequence[ColumnLayout],
+    parts: Sequence[FloatArray] = (),
+    rank: int = 0,
+) -> list[Outline]:
     """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
-    light, profile = _light_across(strips, grid, layouts[0].sigma)
+    light, profile = _light_across(strips, grid, layouts[0].sigma, parts)
     stands_out = _stands_out(strips, grid)
     found: list[Outline] = []
     for family, layout in enumerate(layouts, rank * len(layouts)):
@@ -303,10 +315,12 @@ def _numbered(strips: PictureStrips, grid: Grid, layouts: Sequence[ColumnLayout]
     return sorted(found, key=lambda candidate: -candidate.log_odds)
 
 
-def _light_across(strips: PictureStrips, grid: Grid, sigma: float) -> tuple[Float32Array, LightProfile]:
+def _light_across(
+    strips: PictureStrips, grid: Grid, sigma: float, parts: Sequence[FloatArray] = ()
+) -> tuple[Float32Array, LightProfile]:
     """Light of the strips that a grid predicts, and its profile across the columns."""
     light = predicted_light(strips, columns_at(grid.coefficients, strips.x, strips.y), sigma)
-    return light, light_profile(strips, light, grid)
+    return light, light_profile(strips, light, grid, parts)
 
 
 def _unlit_sides(

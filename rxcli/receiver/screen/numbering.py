@@ -6,6 +6,7 @@ does so by chance only. The weights of the features are fitted data, `models/num
 """
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -30,6 +31,8 @@ _ENDS, _IN_VIEW = 0.15, 0.3
 #: Parts are faint up to this share of the way from the darkest to the brightest (percentile), of the root of light;
 #: standard deviations of a plain difference between the means beside a border, and their minimum, of white.
 _DARK, _FAINT, _PLAIN_EDGE, _MIN_FAINT_SD = 10, 0.05, 4.0, 0.0004
+#: Standard deviation of the sides of a bright part against the screen's, screen widths.
+_SIDE_SD = 0.0125
 #: Distances from the screen's middle, screen widths, within which edges lie that it has in pairs: of films and of the
 #: screen's frame.
 _PAIRED = (0.22, 0.58)
@@ -48,6 +51,7 @@ class _Weights(msgspec.Struct, frozen=True):
     light_on_border: float
     faint_on_border: float
     paired_edges: float
+    part_between: float
 
 
 class _Model(msgspec.Struct, frozen=True):
@@ -60,7 +64,7 @@ WEIGHTS = _Weights.__struct_fields__
 
 @lru_cache(maxsize=1)
 def numbering_weights() -> FloatArray:
-    """(10,) the shipped weights, in the order of the features."""
+    """(11,) the shipped weights, in the order of the features."""
     path = data_dir("models") / "numbering" / "model.toml"
     model = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _Model)
     return np.array(msgspec.structs.astuple(model.weights))
@@ -83,6 +87,8 @@ class LightProfile:
     faint: FloatArray
     #: Column at the picture's middle.
     picture_middle: float
+    #: (Q, 2) columns at the left and the right of bright parts with four straight sides.
+    sides: FloatArray
 
     @property
     def light(self) -> FloatArray:
@@ -108,13 +114,16 @@ class LightProfile:
         return _at_or_beside(np.clip(steps, 0, 1)), _at_or_beside(np.clip(-steps, 0, 1))
 
 
-def light_profile(strips: PictureStrips, light: Float32Array, grid: Grid) -> LightProfile:
+def light_profile(
+    strips: PictureStrips, light: Float32Array, grid: Grid, parts: Sequence[FloatArray] = ()
+) -> LightProfile:
     """Measure the light across the columns of a grid.
 
     Args:
         strips: of the picture.
         light: (B, S, R) products of the strips with the waveforms predicted from their neighbours, `predicted_light`.
         grid: of the picture.
+        parts: corners (4, 2) of bright parts of the picture, clockwise from the top left.
     """
     u = columns_at(grid.coefficients, strips.x, strips.y)
     origin = int(np.floor(u.min())) - 1
@@ -139,7 +148,10 @@ def light_profile(strips: PictureStrips, light: Float32Array, grid: Grid) -> Lig
     usual = np.median(of_columns) if of_columns.size else np.inf
     steady = np.clip(darkest - usual, 0, _MAX_STEADY) * (1 - coherent) * shown
     place = origin + (np.arange(n) + 0.5) / _PARTS
-    return LightProfile(place, count > 0, coherent, level, steady, is_faint, faint, float(grid.coefficients[0]))
+    corners = grid.columns_at(np.reshape(parts, (-1, 4, 2)))
+    sides = np.stack([corners[:, [0, 3]].mean(axis=1), corners[:, [1, 2]].mean(axis=1)], axis=1)
+    middle = float(grid.coefficients[0])
+    return LightProfile(place, count > 0, coherent, level, steady, is_faint, faint, middle, sides)
 
 
 def _faint_light(root: FloatArray, shown: BoolArray) -> tuple[BoolArray, FloatArray]:
@@ -167,7 +179,7 @@ def first_columns(light: LightProfile, n_columns: int) -> tuple[IntArray, FloatA
 
 
 def first_column_features(light: LightProfile, n_columns: int) -> tuple[IntArray, FloatArray, bool]:
-    """Columns (F,) of a grid, their features (F, 10) in the order of the weights, and whether no side is in view."""
+    """Columns (F,) of a grid, their features (F, 11) in the order of the weights, and whether no side is in view."""
     shown = light.place[light.in_picture]
     left, right = float(shown.min()), float(shown.max())
     starts = np.arange(int(left) - n_columns + 3, int(right) - 2)
@@ -194,10 +206,17 @@ def first_column_features(light: LightProfile, n_columns: int) -> tuple[IntArray
         _at(rises, border) + _at(falls, border + width),
         _at(brightens, border) + _at(fades, border + width),
         _paired(rises, falls, border + width // 2, width),
+        _between(light.sides, np.stack([starts, ends], axis=1) / n_columns, n_columns),
     )
     # Light across more columns than the screen has is not all the columns'.
     fills = bool(reaches.all()) and right - left < n_columns
     return starts, np.stack(terms, axis=1).astype(np.float64), fills
+
+
+def _between(sides: FloatArray, screens: FloatArray, n_columns: int) -> FloatArray:
+    """(F,) 0..1: how near the sides (Q, 2) of any bright part, columns, are to those of screens (F, 2), widths."""
+    off = (sides[:, None] / n_columns - screens) / _SIDE_SD
+    return np.asarray(np.exp(-0.5 * np.square(off).sum(axis=2)).max(axis=0, initial=0.0))
 
 
 def _paired(rises: FloatArray, falls: FloatArray, middle: IntArray, width: int) -> FloatArray:

@@ -15,7 +15,7 @@ from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.plane import turned
 from rxcli.receiver.plane.orientation import PORTRAIT
 from rxcli.receiver.screen import find, geometry
-from rxcli.receiver.screen.bright import bright_quadrilateral, striped_box
+from rxcli.receiver.screen.bright import bright_quadrilateral, faint_quadrilaterals, striped_box
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.stripes import MIN_LEAN, stripe_lean
 from rxcli.receiver.search.cameras import known_lens
@@ -28,6 +28,9 @@ _TOO_SLOW = (
 #: Log-odds of the bright part of a picture against columns that were found; probability that it, or the part with
 #: stripes, is the whole screen, if it shows packets; and the share of its width within which corners are the same.
 _BRIGHT_LOG_ODDS, _BRIGHT_CERTAINTY, _SAME_OUTLINE = -50.0, 0.9, 0.025
+#: Natural logarithm of the ratio of aspects up to which a bright part may be the screen, and its probability beyond: of
+#: 39 bright parts of dark pictures none had the screen's aspect, and films alone, one in three, its width.
+_SAME_ASPECT, _FILM_CERTAINTY = 0.08, 0.3
 ON_ITS_SIDE = (
     "if the picture shows a screen that sends, its columns lie along the rows, as in portrait or where a picture was "
     "turned after it was taken; use the camera's own file, taken in landscape"
@@ -106,7 +109,8 @@ def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
     with cache.timer("geometry"):
         bright = _bright(cache)
         key = ("screens", *layouts, key_of(lens))
-        screens = cache.once(key, lambda: find.find_screens(cache.plane, layouts, lens, bright))
+        parts = cache.once("parts", lambda: faint_quadrilaterals(cache.plane)) + ([] if bright is None else [bright])
+        screens = cache.once(key, lambda: find.find_screens(cache.plane, layouts, lens, parts))
     wide = [layout.n_columns for layout in layouts if not layout.is_narrow]
 
     def viewed(outline: Outline) -> Outline:
@@ -117,11 +121,18 @@ def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
     outlines = [[viewed(outline) for outline in screen] for screen in screens]
     if len(outlines) == 1 and bright is not None:
         # The picture on the screen may show borders that are none of the columns'.
-        own = viewed(Outline(bright, _BRIGHT_CERTAINTY, log_odds=_BRIGHT_LOG_ODDS, family=-1))
+        certainty = _BRIGHT_CERTAINTY if _may_be_screen(bright, layouts) else _FILM_CERTAINTY
+        own = viewed(Outline(bright, certainty, log_odds=_BRIGHT_LOG_ODDS, family=-1))
         tolerance = _SAME_OUTLINE * np.ptp(bright[:, 0])
         if all(np.abs(outline.corners - own.corners).max() >= tolerance for outline in outlines[0]):
             outlines[0].append(own)
     return outlines
+
+
+def _may_be_screen(corners: FloatArray, layouts: list[find.ColumnLayout]) -> bool:
+    """Whether a part of the picture has a screen's aspect, unlike windows and films."""
+    width, height = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).reshape(2, 2).sum(axis=0)
+    return any(abs(np.log(width / height / layout.aspect)) < _SAME_ASPECT for layout in layouts)
 
 
 def layouts_of(options: ReceiverOptions) -> list[find.ColumnLayout]:

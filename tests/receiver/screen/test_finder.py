@@ -289,7 +289,7 @@ def test_a_second_grid_is_proposed_where_it_does_nearly_as_well(monkeypatch: pyt
     plane, narrower = drawn("blobs"), CORNERS.mean(axis=0) + (CORNERS - CORNERS.mean(axis=0)) * np.array([0.8, 1.0])
     for nearly, families in ((0.0, {0}), (99.0, {0, 1})):
         monkeypatch.setattr(find, "_NEARLY_BEST", nearly)
-        (outlines,) = find_screens(plane, [WIDE], None, narrower)
+        (outlines,) = find_screens(plane, [WIDE], None, [narrower])
         assert {one.family for one in outlines} == families
         assert outlines[0].family == 0
     second = next(one for one in outlines if one.family == 1)
@@ -317,11 +317,14 @@ def test_grids_compare_by_contrast_and_by_what_they_explain(
         explained, contrast = lights[grid.pitch_px]
         return replace(grid, explained=explained, contrast=contrast)
 
-    monkeypatch.setattr(find, "find_combs", lambda *_: [])
+    monkeypatch.setattr(find, "find_combs", lambda *_: rivals)
+    monkeypatch.setattr(find, "grid_of_comb", lambda grid, _: replace(grid))
     monkeypatch.setattr(find, "moved_by_waveforms", lambda _, grid, *__: grid)
     monkeypatch.setattr(find, "with_light", lit)
-    proposed = [grid.pitch_px for grid in wide_grids(strips, 0.45, rivals)]
+    proposed = [grid.pitch_px for grid in wide_grids(strips, 0.45)]
     assert proposed == [grid.pitch_px for grid in rivals][:n_proposed]
+    monkeypatch.setattr(find, "find_combs", lambda *_: rivals[:1])
+    assert wide_grids(strips, 0.45, rivals[1:])[0].pitch_px == rivals[share == 1.2].pitch_px
 
 
 def test_combs_are_fitted_by_their_likelihood_as_borders_out_of_place_stand_out_little(
@@ -380,7 +383,7 @@ def profile(start: float, end: float, *, film: tuple[float, float] | None = None
     coherent = ((place > start) & (place < end)).astype(np.float64)
     level = coherent if film is None else ((place > film[0]) & (place < film[1])).astype(np.float64)
     none = np.zeros(place.size)
-    return LightProfile(place, np.ones(place.size, bool), coherent, level, none, none > 0, none, 10.0)
+    return LightProfile(place, np.ones(place.size, bool), coherent, level, none, none > 0, none, 10.0, np.zeros((0, 2)))
 
 
 @pytest.mark.parametrize("film", [(2.75, 17.25), (2.5, 16.25)])
@@ -397,6 +400,15 @@ def test_the_little_light_that_a_dark_panel_passes_shows_the_first_column(first:
     inside = (light.place > first) & (light.place < first + 20)
     columns, log_odds, _ = first_columns(replace(light, is_faint=light.coherent == 0, faint=0.4 * inside), 20)
     assert columns[log_odds.argmax()] == first
+
+
+@pytest.mark.parametrize("off", [0.0, 0.2, 0.9])
+def test_a_part_with_the_sides_of_a_screen_shows_the_first_column(off: float) -> None:
+    sides = np.array([[4.0, 15.0], [1.0 + off, 21.0 + off]])
+    columns, log_odds, _ = first_columns(replace(profile(7, 13), sides=sides), 20)
+    certainty = 1 / np.exp(log_odds - log_odds.max()).sum()
+    assert columns[log_odds.argmax()] == round(1 + off)
+    assert certainty > 0.9
 
 
 @pytest.mark.parametrize(("step", "is_plain"), [(1.5, True), (0.1, False)])
