@@ -58,7 +58,11 @@ def distort(points: FloatArray, coefficients: FloatArray) -> FloatArray:
 
 
 def undistort(points: FloatArray, coefficients: FloatArray, iterations: int = 12) -> FloatArray:
-    """The inverse of `distort`, by Newton's method with a numeric Jacobian."""
+    """The inverse of `distort`, by Newton's method with a numeric Jacobian.
+
+    Far outside the picture a lens polynomial may fold back, where the determinant vanishes: there it counts as
+    positive and steps are short, so that places stay finite.
+    """
     ideal = np.array(points, np.float64)
     if not np.any(coefficients):
         return ideal
