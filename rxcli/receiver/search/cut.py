@@ -176,7 +176,8 @@ def _candidates(slots: _Slots) -> Iterator[_Candidate]:
         longer = clock.packet_slots + SLOTS_PER_SYMBOL
         without = {phase: _fit(initial, PREAMBLE_SLOTS + phase, longer) for phase in range(SLOTS_PER_SYMBOL)}
         starts: dict[int, tuple[float, bool]] = {}
-        for phase in sorted(without, key=lambda phase: -without[phase])[: SETTINGS.cut_symbol_phases]:
+        likely = [phase for phase in without if without[phase] > SETTINGS.cut_fit]
+        for phase in sorted(likely, key=lambda phase: -without[phase])[: SETTINGS.cut_symbol_phases]:
             for first_slot in range(phase, n, SLOTS_PER_SYMBOL):
                 # The last slot of the clock lies beyond the picture.
                 if first_slot < PREAMBLE_SLOTS or first_slot + clock.n_slots > n + 1:
@@ -199,9 +200,10 @@ def _started(clock: Clock, first_slot: int, packet_slots: int) -> Clock:
 
 
 def _distinct(candidates: Iterable[_Candidate]) -> list[_Candidate]:
-    """The likeliest few whose symbols begin at different places."""
+    """The likeliest few whose symbols begin at different places; none that fits no better than noise."""
     out: list[_Candidate] = []
-    for candidate in sorted(candidates, key=lambda candidate: -candidate.fit):
+    fitting = (candidate for candidate in candidates if candidate.fit > SETTINGS.cut_fit)
+    for candidate in sorted(fitting, key=lambda candidate: -candidate.fit):
         if len(out) < SETTINGS.max_cut and not any(candidate.is_near(better) for better in out):
             out.append(candidate)
     return out

@@ -60,13 +60,14 @@ class SearchSettings:
 
     #: Less than a packet in view: fewest symbols, phases of a slot that are tried, phases of a symbol at which headers
     #: are sought, clocks that are handed on, log evidence by which a start with a part of the header in view must lead,
-    #: and least log-likelihood ratio of a column.
+    #: least log-likelihood ratio of a column, and least fit of a clock: noise has 20 times that of a column.
     cut_symbols: int = 2
     cut_phases: int = 4
     cut_symbol_phases: int = 4
     max_cut: int = 4
     cut_start: float = 10.0
     worst_fit: float = -20.0
+    cut_fit: float = -350.0
     #: Room light that is tried where no header is in view, relative to its estimate, which counts what is lit in part.
     cut_room_lights: tuple[float, ...] = (1.0, 0.8, 0.6)
     #: Natural logarithm of the ratio of exposures, stated and by the width of stripes, up to which they may agree.

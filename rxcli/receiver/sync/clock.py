@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import TINY, folded, header_correlation, peak_offset
 from rxcli.protocol import EXTREMES_SLOTS, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
-from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MAX_EXPOSURE_SLOTS, dark_sigma, take_places
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MAX_EXPOSURE_SLOTS, dark_sigma
 from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
@@ -97,9 +97,9 @@ def _integrate(values: Float32Array, positions: FloatArray) -> FloatArray:
     """Integral of piecewise constant `values` (n, R) between neighbouring `positions`; (n, positions - 1) float64."""
     total = np.zeros((len(values), values.shape[1] + 1))
     np.cumsum(values, axis=1, dtype=np.float64, out=total[:, 1:])
-    left = np.minimum(positions.astype(np.int64), values.shape[1] - 1)
-    below, above = take_places(total, left), take_places(total, left + 1)
-    return np.asarray(np.diff(below + (above - below) * (positions - left), axis=1))
+    borders = np.arange(total.shape[1], dtype=np.float64)
+    places = np.broadcast_to(positions, (len(values), positions.shape[1]))
+    return np.diff([np.interp(at, borders, row) for at, row in zip(places, total, strict=True)], axis=1)
 
 
 def contrast(

@@ -91,3 +91,14 @@ def test_columns_are_told_apart_by_the_right_outline(monkeypatch: pytest.MonkeyP
     between = replace(profiles, light=(profiles.light + np.roll(profiles.light, 1, axis=0)) / 2)
     right, wrong = cut._ways_to_read(seen(monkeypatch, [profiles, between]))
     assert right.evidence > wrong.evidence + 1
+
+
+def test_clocks_that_fit_no_better_than_light_without_slots_are_not_handed_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, shot = np.random.default_rng(5), Shot(8.0, 0.8, 33.0, 560)
+    profiles = row_profiles(random_link(rng, [5] * 20, SCREEN.payload_symbols), shot, rng)
+    (slots,) = cut._slots_by(seen(monkeypatch, [profiles])[0])
+    found = sorted(cut._candidates(slots), key=lambda candidate: -candidate.fit)
+    assert cut._distinct([replace(found[0], fit=-400.0), replace(found[-1], fit=-300.0)])[0].fit == -300.0
+    assert cut._distinct([replace(found[0], fit=-400.0)]) == []
+    monkeypatch.setattr(cut, "_fit", lambda *_: -400.0)
+    assert list(cut._candidates(slots)) == []
