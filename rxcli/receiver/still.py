@@ -279,7 +279,7 @@ def follow_picture(
         dimming = reception.n_observed[:, columns, SLOTS_PER_SYMBOL:PREAMBLE_SLOTS].sum(axis=2, keepdims=True)
         least = np.where((dimming > 0) & (not keeps_weights), STILL.min_weight_log_prior, STILL.no_weight)
         bursts = _with_weights(bursts, reception.posteriors.w_log_prob[columns], least)
-    # Of long exposures columns are too rarely right to tell what they have in common.
+    # Of long exposures columns are too rarely right to show what they have in common.
     found = survivors.detect(bursts, has_common_weights=not reception.is_long)
     header_llr, log_prob = reception.posteriors.header_llr[:, columns], found.log_prob
     if reception.is_long:  # Where arbitrary slots explain a column as well, it may have no packets.
