@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.screen.geometry import homography
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search.hypothesis import Scored
 from rxcli.receiver.search.propose import Proposer
@@ -17,6 +18,8 @@ from rxcli.receiver.still import initial_pass
 
 #: Columns that are read beside the outermost, because they shed light there.
 _BESIDE = 2
+#: Distance from a screen's sides within which those of another outline are the same, screen widths.
+_SAME_COLUMNS = 0.025
 
 
 def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Proposer) -> list[Outline]:
@@ -61,7 +64,11 @@ def numbered(own: Outline, outlines: Sequence[Outline], score_of: Callable[[int]
         score_of: the best score under outlines of a family, or None if none was tried.
     """
     family_odds = np.array([outline.log_odds for outline in outlines if outline.family == own.family])
-    families = {outline.family for outline in outlines}
+    likeliest = {outline.family: outline for outline in sorted(outlines, key=lambda outline: outline.log_odds)}
+    # An outline with the same columns, as of a film between bars, numbers them equally.
+    families = {
+        family for family, rival in likeliest.items() if family == own.family or not _has_columns_of(own, rival)
+    }
     scores = np.array([score for family in families if (score := score_of(family)) is not None])
     mine = score_of(own.family)
     certainty = own.certainty / float(np.exp(np.sort(family_odds) - own.log_odds).sum())
@@ -70,6 +77,13 @@ def numbered(own: Outline, outlines: Sequence[Outline], score_of: Callable[[int]
     return replace(
         own, certainty=certainty, column_offset=own.column_offset if certainty >= SETTINGS.sure_certainty else None
     )
+
+
+def _has_columns_of(own: Outline, rival: Outline) -> bool:
+    """Whether a rival's columns are where one's own are, on whatever rows."""
+    points = np.pad(rival.corners, ((0, 0), (0, 1)), constant_values=1.0) @ np.linalg.inv(homography(own.corners)).T
+    off = points[:, 0] / points[:, 2] - [0, 1, 1, 0]
+    return rival.n_columns in (None, own.n_columns) and bool(np.abs(off).max() < _SAME_COLUMNS)
 
 
 def _columns_between(own: Outline, rival: Outline, n_columns: int) -> int:

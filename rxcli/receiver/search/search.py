@@ -247,13 +247,15 @@ class _Walk:
             return
         if (best is not None or is_costly) and hypothesis.screen.columns > SETTINGS.few_columns:
             half = self._measured(hypothesis, acquisition.of_columns(acquisition.middle_columns))
-            min_score, min_evidence = -np.inf, SETTINGS.bail
+            min_score, min_evidence, lead = -np.inf, SETTINGS.bail, 0.0
             if best is not None:
+                lead = evidence.middle_score(best) - best.score if best.evidence > SETTINGS.bail else 0.0
                 is_plain = best.evidence > SETTINGS.plain
-                min_score = evidence.middle_score(best) if is_plain else best.score - SETTINGS.reach
+                min_score = best.score + (lead if is_plain else -SETTINGS.reach)
                 min_evidence = min(SETTINGS.bail, best.evidence)
             if half.score < min_score or half.evidence < min_evidence:
-                self._tried.append(Tried(hypothesis, half.evidence, half.score, "half"))
+                # By the middle columns alone scores are others than by all: the best one shows by how much.
+                self._tried.append(Tried(hypothesis, half.evidence, half.score - lead, "half"))
                 self._n_in_vain += is_costly and half.evidence < SETTINGS.bail
                 return
         scored = self._measured(hypothesis, acquisition)

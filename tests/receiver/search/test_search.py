@@ -152,6 +152,16 @@ def test_columns_with_packets_are_not_left_out_of_the_screen() -> None:
     assert max(one.log_odds for one in less_likely) < -3.0
 
 
+def test_scores_by_the_middle_columns_compare_with_those_by_all() -> None:
+    trial = trial_of("paper-17k3")
+    options = ReceiverOptions(cameras=(trial.camera,), force_camera=True)
+    outlines = [Outline(trial.corners, log_odds=-odds, family=family) for family, odds in enumerate((0.0, 1.0))]
+    found = search(FrameCache(trial.frame), options, outlines=outlines)
+    assert isinstance(found, Found)
+    (half,) = (step for step in found.tried if step.fate == "half")
+    assert found.best.score - 10 < half.score < found.best.score
+
+
 @pytest.mark.parametrize(("exposure_slots", "first", "n_measured"), [(4.0, "middle", 3), (1.0, "all", 9)])
 def test_long_exposures_are_measured_on_their_middle_columns_first_until_three_were_in_vain(
     exposure_slots: float, first: str, n_measured: int, monkeypatch: pytest.MonkeyPatch
