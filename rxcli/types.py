@@ -196,6 +196,8 @@ class RowProfiles:
     noise_slope: float
     #: (C, S, R) float32: light of a half-lit row; None where the picture is unknown.
     level: Float32Array | None = None
+    #: Whether the sensor's rows are so noisy that it shows.
+    has_row_noise: bool = False
 
     def variance(self) -> Float32Array:
         """(C, S, R) variance of `light` by the noise model."""

@@ -95,7 +95,9 @@ def decode(
         if (doubtful := np.intersect1d(lit, doubtful_columns(reception))).size:
             reception, _ = without_row_noise(acquisition, reception, doubtful)
     elif lit.size:
-        reception = follow_picture(acquisition, reception, lit, keeps_weights=keeps_weights)
+        # Noise of rows is estimated from the slots: again once these are better.
+        for _ in range(1 + (acquisition.profiles.has_row_noise and not initial.is_long)):
+            reception = follow_picture(acquisition, reception, lit, keeps_weights=keeps_weights)
     return replace(reception, skipped={name: count for name, count in skipped.items() if count})
 
 
@@ -273,6 +275,8 @@ def follow_picture(
         clock = reception.clock
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), q, ratios.by_start(clock))
     lit = clock.on_grid(reception.posteriors.lit)
+    if not reception.is_long:
+        samples = denoise.remove_row_noise(samples, ratios.whole_light(lit, clock, model.crosstalk, q), model)
     bursts = ratios.burst_samples(samples, clock, model, columns, lit)
     if not reception.is_long:
         # Paths that see nothing of a packet's start would keep the weights of fewest words.
@@ -371,7 +375,8 @@ def without_row_noise(
     """Metrics of some columns on the fine grid after removal of row noise; and the input of the auto-encoder."""
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), denoise.SAMPLES_PER_SLOT)
     lit = reception.clock.on_grid(reception.posteriors.lit)
-    samples = denoise.remove_row_noise(reception.scene_of(samples, model)).samples
+    whole = model.expected(lit, reception.clock, np.arange(len(lit))).whole
+    samples = denoise.remove_row_noise(samples, whole, model)
     likelihoods = channel.slot_likelihoods(samples.of_columns(columns), reception.clock, model, lit, columns)
     by_slot = _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr)
     return by_slot, by_slot.scene_of(samples, model)

@@ -11,29 +11,32 @@ from rxcli.protocol import WEIGHTS, encode_packet
 from rxcli.receiver.channel import ObservationModel
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, SlotLight
-from rxcli.receiver.still import detect_jointly, lateness
+from rxcli.receiver.still import decode, detect_jointly, initial_pass, lateness
 from rxcli.types import Float32Array
 
 COLUMNS, STRIPS, ROWS_PER_SLOT, W = 4, 4, 8.0, 4
 UNKNOWN = np.full((COLUMNS, len(WEIGHTS)), -np.log(len(WEIGHTS)))
 
 
-def rough_frame(exposure_slots: float, texture: float) -> tuple[Acquisition, ObservationModel, Float32Array]:
+def rough_frame(
+    exposure_slots: float, texture: float, n_columns: int = COLUMNS, row_noise: float = 0.0
+) -> tuple[Acquisition, ObservationModel, Float32Array]:
     """One packet in every column, whose picture changes from row to row; and the slots that were sent."""
     rng = np.random.default_rng(4)
     screen = load_profile("paper-8k65", ScreenProfile)
     n = screen.packet_slots
-    bits = rng.integers(0, 2, (COLUMNS, screen.payload_symbols * 7)).astype(np.uint8)
+    bits = rng.integers(0, 2, (n_columns, screen.payload_symbols * 7)).astype(np.uint8)
     sent = np.stack([encode_packet(each, W) for each in bits]).astype(np.float32)
     known = {"rows_per_slot": ROWS_PER_SLOT, "exposure_slots": exposure_slots, "packet_slots": n, "n_slots": n}
     rows = np.arange(int(n * ROWS_PER_SLOT))
     exposed = SlotLight(np.pad(sent, ((0, 0), (5, 5)))).mean_over(
         ((rows + 0.5) / ROWS_PER_SLOT + 5)[None], exposure_slots
     )
-    picture = np.exp(rng.normal(0, texture, (COLUMNS, 1, rows.size // 4))).repeat(4, axis=2)
-    picture = (picture * rng.uniform(0.8, 1.2, (COLUMNS, STRIPS, 1))).astype(np.float32)
+    picture = np.exp(rng.normal(0, texture, (n_columns, 1, rows.size // 4))).repeat(4, axis=2)
+    picture = (picture * rng.uniform(0.8, 1.2, (n_columns, STRIPS, 1))).astype(np.float32)
     light = picture * exposed[:, None] + rng.normal(0, 0.004, picture.shape)
-    profiles, clock = profiles_of(light, 1.6e-5, level=picture / 2), clock_of(COLUMNS, row0=-0.5, **known)
+    light = light + rng.normal(0, row_noise, rows.size)
+    profiles, clock = profiles_of(light, 1.6e-5, level=picture / 2), clock_of(n_columns, row0=-0.5, **known)
     model = ObservationModel(0.0, NoiseModel(4e-6, 0.0), Crosstalk.of(STRIPS, 0.02), Exposure.of(exposure_slots, 4))
     return Acquisition(screen, profiles, clock, (screen,)), model, sent
 
@@ -48,6 +51,19 @@ def test_a_known_picture_shows_the_slots_behind_it(exposure_slots: float) -> Non
     ]
     assert wrong[0] < 0.02
     assert wrong[1] > 0.1
+
+
+def test_noise_of_rows_is_taken_off_by_the_slots_of_all_columns() -> None:
+    """Twelve columns share each row's noise, half their light: the slots show it, and better slots show it better."""
+    acquisition, _, sent = rough_frame(1.0, 0.02, n_columns=12, row_noise=0.5)
+    first = initial_pass(replace(acquisition, profiles=replace(acquisition.profiles, level=None)))
+    wrong = [np.mean((first.posteriors.lit[0] > 0.5) != (sent > 0.5))]
+    for has_row_noise in (False, True):
+        profiles = replace(acquisition.profiles, level=None, has_row_noise=has_row_noise)
+        found = decode(replace(acquisition, profiles=profiles), frozenset(), first)
+        wrong.append(np.mean((found.posteriors.lit[0] > 0.5) != (sent > 0.5)))
+    assert wrong[1] < 0.5 * wrong[0]
+    assert wrong[2] < wrong[1]
 
 
 @pytest.mark.parametrize("late", [-0.2, 0.0, 0.15])

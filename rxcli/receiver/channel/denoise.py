@@ -31,7 +31,7 @@ from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
-from rxcli.receiver.light import Crosstalk, slot_llr
+from rxcli.receiver.light import NoiseModel, slot_llr
 from rxcli.resources import data_dir, onnx_runtime
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
@@ -66,19 +66,22 @@ class DenoiserInput:
     model: ObservationModel
 
 
-def remove_row_noise(scene: DenoiserInput) -> DenoiserInput:
+def remove_row_noise(samples: SlotSamples, whole: Float32Array, model: ObservationModel) -> SlotSamples:
     """Remove row noise, the light that a sensor row has in common everywhere.
 
     It is estimated for every column from the residuals of the other columns at the same instant, and from every second
     strip, since errors of the strips of a column are correlated.
+
+    Args:
+        samples: of all columns.
+        whole: (C, S, n) light of all columns per unit of picture, given the current slots.
+        model: the light model.
     """
-    strips = slice(None, None, 2)
-    thin = replace(scene.samples, light=scene.samples.light[:, strips], valid=scene.samples.valid[:, strips])
-    model = replace(scene.model, crosstalk=Crosstalk(scene.model.crosstalk.shares[strips]))
-    observed = _residuals(replace(scene, samples=thin, model=model), np.arange(len(scene.lit)))
-    rows = _row_light(np.clip(observed.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS), observed.scale)[:, None]
-    samples = replace(scene.samples, light=scene.samples.light - rows * scene.samples.valid)
-    return replace(scene, samples=samples)
+    thin = slice(None, None, 2)
+    light, valid = model.over_black(samples)[:, thin], samples.valid[:, thin]
+    residual, scale, _ = _residual(light, valid, whole[:, thin], model.noise, samples.samples_per_slot)
+    rows = _row_light(np.clip(residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS), scale)[:, None]
+    return replace(samples, light=samples.light - rows * samples.valid)
 
 
 def network_inputs(scene: DenoiserInput, columns: NDArray[np.int64]) -> tuple[Float32Array, Float32Array]:
@@ -114,15 +117,20 @@ def _residuals(scene: DenoiserInput, columns: NDArray[np.int64]) -> _Residuals:
     model, valid = scene.model, scene.samples.valid[columns]
     light = model.over_black(scene.samples)[columns]
     expected = model.expected(scene.lit, scene.clock, columns)
-    whole = expected.whole
-    q = scene.samples.samples_per_slot
-    sums = PictureSums.of(*(by_place(each, q) for each in (light, whole, valid)))
-    prediction = predict_picture(sums, model.noise.dark_variance, SETTINGS.picture_scales, one_sided=False)
-    picture = in_time(prediction.at_samples(q))
-    noise = model.noise.through_picture(picture, np.repeat(prediction.variance[0], q, axis=-1), whole)
-    scale = np.asarray(valid / np.sqrt(noise), np.float32)
-    residual = (light - picture * whole) * scale
+    residual, scale, picture = _residual(light, valid, expected.whole, model.noise, scene.samples.samples_per_slot)
     return _Residuals(light, expected, scale, picture * expected.own * scale, residual)
+
+
+def _residual(
+    light: Float32Array, valid: Float32Array, whole: Float32Array, noise: NoiseModel, q: int
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Residual of light in standard deviations, one over these, and the picture; (C, S, n)."""
+    sums = PictureSums.of(*(by_place(each, q) for each in (light, whole, valid)))
+    prediction = predict_picture(sums, noise.dark_variance, SETTINGS.picture_scales, one_sided=False)
+    picture = in_time(prediction.at_samples(q))
+    variance = noise.through_picture(picture, np.repeat(prediction.variance[0], q, axis=-1), whole)
+    scale = np.asarray(valid / np.sqrt(variance), np.float32)
+    return (light - picture * whole) * scale, scale, picture
 
 
 def _row_light(residual: Float32Array, scale: Float32Array) -> Float32Array:

@@ -10,7 +10,7 @@ from rxcli.numerics import mean_of_valid
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.model import ObservationModel
 from rxcli.receiver.channel.settings import SETTINGS
-from rxcli.receiver.light import exposed_from
+from rxcli.receiver.light import Crosstalk, exposed_from
 from rxcli.types import BurstSamples, Clock, Float32Array, IntArray, SlotSamples
 
 
@@ -77,6 +77,13 @@ def own_light(light: Float32Array) -> Float32Array:
     n_strips = light.shape[1]
     third = n_strips // 3
     return np.asarray(np.clip(light[:, third : n_strips - third].mean(axis=1) / 2, 0, 1), np.float32)
+
+
+def whole_light(lit: Float32Array, clock: Clock, crosstalk: Crosstalk, samples_per_slot: int) -> Float32Array:
+    """(C, S, N * Q) light of all columns in their strips per unit of picture, by the start of exposures."""
+    ahead = np.diff(clock.delay_slots) * samples_per_slot if clock.delay_slots.any() else None
+    own = light_of_slots(lit, clock.exposure_slots, samples_per_slot)
+    return crosstalk.from_neighbours(own, np.arange(len(lit)), ahead) + crosstalk.own * own[:, None]
 
 
 def light_of_slots(lit: Float32Array, exposure_slots: float, samples_per_slot: int) -> Float32Array:

@@ -100,6 +100,6 @@ class FrameCache:
             if same and np.array_equal(edges, outlines.edges_x) and np.array_equal(profiles.rows, outlines.rows):
                 self._sampled.append(self._sampled.pop(place))  # as the last one used
                 return replace(profiles, sensor_row=outlines.sensor_row)
-        profiles = sample_rows(self.plane, outlines, tone)
+        profiles = replace(sample_rows(self.plane, outlines, tone), has_row_noise=self._read[1] is not None)
         self._sampled = [*self._sampled[-_MAX_SAMPLED + 1 :], (tone, outlines.edges_x, profiles)]
         return profiles

@@ -55,6 +55,8 @@ def test_noise_is_taken_out_along_bent_rows(k1: float) -> None:
     noisy.__dict__["plane"] = read_plane(cache.frame)
     left, before = (np.square(changes(each) - changes(plain)).mean() for each in (cache, noisy))
     assert left < 0.5 * before
+    outlines = cache.outlines(np.array([[9.0, 9], [890, 9], [890, 1190], [9, 1190]]), 20, None)
+    assert [each.sample(outlines, "srgb").has_row_noise for each in (cache, plain)] == [True, False]
     noise = find_row_noise(read_plane(cache.frame))
     # The rows are bent as far as they were drawn.
     x = y = 0.45
