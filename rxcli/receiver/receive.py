@@ -182,9 +182,9 @@ def _with_cut_packets(cache: FrameCache, received: Received, options: ReceiverOp
     screens = proposed_screens(cache, options)
     if isinstance(screens, Failure):
         return own
-    camera, own_screens = known or UNKNOWN, _of_columns(result, options)
-    families = {outline.family: outline for outline in reversed(screens[0])}.values()
-    cut = cut_packets([FrameContext(cache, outline.corners, camera, own_screens) for outline in families])
+    families = list({outline.family: outline for outline in reversed(screens[0])}.values())
+    context = FrameContext(cache, screens[0][0].corners, known or UNKNOWN, _of_columns(result, options))
+    cut = cut_packets(context, families)
     likeliest, *less_likely = (*cut, *([own] if own else ())) or (None,)
     return None if likeliest is None else replace(likeliest, alternatives=tuple(less_likely))
 

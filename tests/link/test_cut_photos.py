@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -115,9 +116,13 @@ def test_a_whole_packet_without_a_text_is_decoded_once(monkeypatch: pytest.Monke
     assert len(tried) == len(set(tried)) > 0
 
 
-#: Slot at the first row, and whether no header is in view: five slots of the packet before are, of the second.
-@pytest.mark.parametrize(("start_slot", "is_open"), [(12.0, True), (112.0, False)])
-def test_a_picture_of_less_than_a_packet_gives_its_text(start_slot: float, is_open: bool) -> None:
+#: Slot at the first row; the line delay that is stated, times the right one; whether no header is in view: five slots
+#: of the packet before are, of the last ones.
+@pytest.mark.parametrize(
+    ("start_slot", "stated", "is_open"),
+    [(12.0, 1.0, True), (12.0, None, True), (112.0, None, False), (112.0, 1.02, False)],
+)
+def test_a_picture_of_less_than_a_packet_gives_its_text(start_slot: float, stated: float | None, is_open: bool) -> None:
     rng = np.random.default_rng(4)
     drawn = Population(
         screens=("data-17k3",),
@@ -131,9 +136,13 @@ def test_a_picture_of_less_than_a_packet_gives_its_text(start_slot: float, is_op
     scene, _ = drawn.draw(rng)
     scene = replace(scene, labels=message("hello there"), start_slot=start_slot, w=5)
     trial = simulate_trial(scene, 1)
-    for is_known in (True, False):
-        options = ReceiverOptions(cameras=(trial.camera,) * is_known, force_camera=is_known, corners=trial.corners)
-        result = receive_frame(trial.frame, replace(options, soft_bits=True))
-        assert not any(packet.confidence >= BELIEVABLE for packet in result.packets)
-        assert result.soft_bits.open_start == is_open
-        assert [m.text for m in Collector(options.screens).add(result).messages] == ["hello there"]
+    cameras = ()
+    if stated is not None:
+        (mode,) = trial.camera.modes
+        mode = msgspec.structs.replace(mode, line_delay_s=stated * mode.line_delay_s)
+        cameras = (msgspec.structs.replace(trial.camera, modes=(mode,)),)
+    options = ReceiverOptions(cameras=cameras, force_camera=bool(cameras), corners=trial.corners, soft_bits=True)
+    result = receive_frame(trial.frame, options)
+    assert not any(packet.confidence >= BELIEVABLE for packet in result.packets)
+    assert result.soft_bits.open_start == is_open
+    assert [m.text for m in Collector(options.screens).add(result).messages] == ["hello there"]

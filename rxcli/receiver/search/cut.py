@@ -11,14 +11,16 @@ from rxcli.numerics import peak_offset
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver import channel
-from rxcli.receiver.camera.settings import SETTINGS as CAMERA
 from rxcli.receiver.decode import detect
 from rxcli.receiver.frame.acquisition import Acquisition, distinct_screens
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception, dark_columns, soft_bits
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
+from rxcli.receiver.screen.find import ColumnLayout
+from rxcli.receiver.screen.outline import Outline
+from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
-from rxcli.receiver.search.cameras import cameras_by_slots, estimated_camera, relabelled_camera, settle_slots
+from rxcli.receiver.search.cameras import UNKNOWN, cameras_by_slots, estimated_camera, relabelled_camera, settle_slots
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import decode, detected_on, initial_pass, slots_of_any_kind
 from rxcli.receiver.sync import clock as sync
@@ -35,9 +37,9 @@ class _Slots:
     context: FrameContext
     #: On the clock of a long packet whose payload is all that is in view.
     acquisition: Acquisition
-    #: (C, N) probability that each slot is lit; and log evidence of them with the picture, on average.
+    #: (C, N) probability that each slot is lit; and log evidence of a slot against the unlikeliest phase.
     lit: Float32Array
-    evidence: float
+    lead: float
     #: Screens that may send them.
     screens: Sequence[ScreenProfile]
 
@@ -59,21 +61,26 @@ class _Candidate:
         return is_same and (own.clock.first_slot - known.clock.first_slot) % SLOTS_PER_SYMBOL == 0
 
 
-def cut_packets(contexts: Sequence[FrameContext]) -> tuple[FrameSoftBits, ...]:
+def cut_packets(context: FrameContext, outlines: Sequence[Outline]) -> tuple[FrameSoftBits, ...]:
     """Soft bits of a frame that shows less than a packet, likeliest first.
 
     Args:
-        contexts: the frame by every outline, with its screens; its camera, or an unknown one.
+        context: the frame with its screens; its camera, or an unknown one.
+        outlines: that its screen may have.
     """
-    with contexts[0].timer("detect"):
-        candidates = (candidate for slots in _best(_ways_to_read(contexts)) for candidate in _candidates(slots))
+    with context.timer("detect"):
+        candidates = (candidate for slots in _best(context, outlines) for candidate in _candidates(slots))
         return tuple(_soft_bits(candidate) for candidate in _distinct(candidates))
 
 
-def _best(ways: Iterable[_Slots]) -> Iterator[_Slots]:
-    """The slots with the largest evidence, of each rate by a known camera, in two directions by an unknown one."""
+def _best(context: FrameContext, outlines: Sequence[Outline]) -> Iterator[_Slots]:
+    """The slots that stand out most, of each rate by a known camera, in two directions by an unknown one."""
+    found = _found(context, outlines)
+    if context.camera.profile is not None and all(slots.lead < SETTINGS.poor_lead for slots in found):
+        # What a profile states is off by a per cent.
+        found += _found(replace(context, camera=UNKNOWN), outlines)
     best: dict[float, _Slots] = {}
-    for slots in sorted(ways, key=lambda slots: slots.evidence):
+    for slots in sorted(found, key=lambda slots: slots.lead):
         best[0.0 if slots.context.camera.hypothesis else slots.screens[0].slot_rate_hz] = slots
     for slots in best.values():
         yield slots
@@ -81,11 +88,14 @@ def _best(ways: Iterable[_Slots]) -> Iterator[_Slots]:
             yield _backwards(slots)
 
 
-def _ways_to_read(contexts: Sequence[FrameContext]) -> Iterator[_Slots]:
-    """The slots of a frame by each outline and camera."""
-    for context in contexts:
-        for by_camera in _cameras(context):
-            yield from (_settled(slots) for slots in _slots_by(by_camera))
+def _found(context: FrameContext, outlines: Sequence[Outline]) -> list[_Slots]:
+    """The slots by every outline and camera."""
+    return [
+        _settled(slots, outline)
+        for outline in outlines
+        for by_camera in _cameras(replace(context, sampled_corners=outline.corners))
+        for slots in _slots_by(by_camera)
+    ]
 
 
 def _cameras(context: FrameContext) -> Iterable[FrameContext]:
@@ -127,25 +137,30 @@ def _slots_by(context: FrameContext) -> Iterator[_Slots]:
     n, step = SETTINGS.cut_phases, rows_per_slot / SETTINGS.cut_phases
     acquisition = Acquisition(screen, profiles, clock, (screen,))
     clocks = [replace(clock, row0=top - part * step) for part in range(n)]
-    found = slots_of_any_kind(acquisition, clocks)
-    best = max(range(n), key=lambda part: found[part][1])
-    lit, log_evidence = found[best]
-    beside = peak_offset(*np.array([found[(best + side) % n][1] for side in (-1, 0, 1)]))
+    evidence_of = [log_evidence for _, log_evidence in slots_of_any_kind(acquisition, clocks)]
+    best = int(np.argmax(evidence_of))
+    beside = peak_offset(*np.take(evidence_of, [best - 1, best, best + 1], mode="wrap"))
     clock = replace(clocks[best], row0=clocks[best].row0 - float(np.clip(beside, -0.5, 0.5)) * step)
-    each = log_evidence * rows_per_slot / (bottom - top)
-    yield _Slots(context, replace(acquisition, clock=clock), clock.on_grid(lit[None]), each, context.screens)
+    ((lit, log_evidence),) = slots_of_any_kind(acquisition, [clock])
+    lead = (log_evidence - min(evidence_of)) / n_slots
+    yield _Slots(context, replace(acquisition, clock=clock), clock.on_grid(lit[None]), lead, context.screens)
 
 
-def _settled(slots: _Slots) -> _Slots:
-    """The slots by their camera fitted to them."""
-    for _ in range(CAMERA.max_fits if slots.context.camera.hypothesis else 0):
-        camera, moved_slots = settle_slots(slots.context, slots.acquisition, slots.acquisition.clock, slots.lit)
-        better = next(_slots_by(replace(slots.context, camera=camera)), slots)
-        if better.evidence <= slots.evidence:
+def _settled(slots: _Slots, outline: Outline) -> _Slots:
+    """The slots by camera and outline as they show them, if these were not given."""
+    context = slots.context
+    for _ in range(SETTINGS.cut_fits if context.camera.hypothesis or outline.strips else 0):
+        acquisition, lens = slots.acquisition, context.camera.lens or outline.lens
+        clock, screen = acquisition.clock, acquisition.screen
+        camera, _moved = settle_slots(context, acquisition, clock, slots.lit)
+        if outline.strips is not None:
+            layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
+            outline = replace(outline, corners=corners_by_slots(outline, layout, clock, slots.lit, lens))
+        context = replace(context, camera=camera, sampled_corners=outline.corners)
+        better = next(_slots_by(context), slots)
+        if better.lead <= slots.lead:
             break
         slots = better
-        if moved_slots < CAMERA.matters_slots:
-            break
     return slots
 
 

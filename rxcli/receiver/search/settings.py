@@ -60,7 +60,9 @@ class SearchSettings:
 
     #: Less than a packet in view: fewest symbols, phases of a slot that are tried, phases of a symbol at which headers
     #: are sought, clocks that are handed on, log evidence by which a start with a part of the header in view must lead,
-    #: least log-likelihood ratio of a column, and least fit of a clock: noise has 20 times that of a column.
+    #: least log-likelihood ratio of a column, least fit of a clock: noise has 20 times that of a column; fits of outline
+    #: and camera, and lead a slot below which a camera profile may be wrong: by right ones pictures reach 22 to 51, by
+    #: ones that are 1 % off 8 to 14.
     cut_symbols: int = 2
     cut_phases: int = 4
     cut_symbol_phases: int = 4
@@ -68,6 +70,8 @@ class SearchSettings:
     cut_start: float = 10.0
     worst_fit: float = -20.0
     cut_fit: float = -350.0
+    cut_fits: int = 3
+    poor_lead: float = 16.0
     #: Room light that is tried where no header is in view, relative to its estimate, which counts what is lit in part.
     cut_room_lights: tuple[float, ...] = (1.0, 0.8, 0.6)
     #: Natural logarithm of the ratio of exposures, stated and by the width of stripes, up to which they may agree.

@@ -47,7 +47,7 @@ def test_a_known_camera_is_not_asked_for_less_than_an_unknown_one(
     """Packets that are plain but none believable: their cut packets come first, then the soft bits as received."""
     monkeypatch.setattr(receive, "proposed_screens", lambda *_: [[Outline(np.zeros((4, 2)))]])
     monkeypatch.setattr(receive, "known_camera", lambda *_: receive.UNKNOWN if is_known else None)
-    monkeypatch.setattr(receive, "cut_packets", lambda _: (shown,))
+    monkeypatch.setattr(receive, "cut_packets", lambda *_: (shown,))
     shown, own = (FrameSoftBits(np.arange(1), np.full((1, 11, 20, 7), value, np.float32)) for value in (1, 0))
     frame = Frame(np.zeros((4, 4), np.uint8), "photo")
     result = FrameResult("photo", 0, 0.0, "no_signal", corners=np.zeros((4, 2)), soft_bits=own)
@@ -89,8 +89,11 @@ def test_columns_are_told_apart_by_the_right_outline(monkeypatch: pytest.MonkeyP
     rng, shot = np.random.default_rng(4), Shot(8.0, 0.8, 33.0, 560, texture=0.2, crosstalk=0.1)
     profiles = row_profiles(random_link(rng, [5] * 20, SCREEN.payload_symbols), shot, rng)
     between = replace(profiles, light=(profiles.light + np.roll(profiles.light, 1, axis=0)) / 2)
-    right, wrong = cut._ways_to_read(seen(monkeypatch, [profiles, between]))
-    assert right.evidence > wrong.evidence + 1
+    right, wrong = (next(cut._slots_by(context)) for context in seen(monkeypatch, [profiles, between]))
+    assert right.lead > 1.5 * wrong.lead
+    outlines = [Outline(np.full((4, 2), n)) for n in (1, 0)]
+    (best,) = cut._best(right.context, outlines)
+    assert best.lead == right.lead
 
 
 def test_clocks_that_fit_no_better_than_light_without_slots_are_not_handed_on(monkeypatch: pytest.MonkeyPatch) -> None:
