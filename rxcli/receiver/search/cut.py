@@ -189,23 +189,24 @@ def _candidates(slots: _Slots) -> Iterator[_Candidate]:
 
         # Packets of any length: longer by a symbol than what is in view, as the first one may begin before the picture.
         longer = clock.packet_slots + SLOTS_PER_SYMBOL
-        without = {phase: _fit(initial, PREAMBLE_SLOTS + phase, longer) for phase in range(SLOTS_PER_SYMBOL)}
+        without = [_begun(initial, PREAMBLE_SLOTS + phase, longer) for phase in range(SLOTS_PER_SYMBOL)]
+        # A header among them is the worst of all words, at the right phase as well.
+        likeliest = np.argsort([-found.column_llr.sum() for found in without])[: SETTINGS.cut_symbol_phases]
         starts: dict[int, tuple[float, bool]] = {}
-        likely = [phase for phase in without if without[phase] > SETTINGS.cut_fit]
-        for phase in sorted(likely, key=lambda phase: -without[phase])[: SETTINGS.cut_symbol_phases]:
+        for phase in likeliest.tolist():
             for first_slot in range(phase, n, SLOTS_PER_SYMBOL):
                 # The last slot of the clock lies beyond the picture.
                 if first_slot < PREAMBLE_SLOTS or first_slot + clock.n_slots > n + 1:
-                    starts[first_slot] = _fit(initial, first_slot, n) - SETTINGS.cut_start, False
+                    starts[first_slot] = evidence.fit(_begun(initial, first_slot, n)) - SETTINGS.cut_start, False
             if PREAMBLE_SLOTS + phase + clock.n_slots <= n + 1:
-                starts[PREAMBLE_SLOTS + phase] = without[phase], True
+                starts[PREAMBLE_SLOTS + phase] = evidence.fit(without[phase]), True
         for first_slot, (fit, is_open) in starts.items():
             yield _Candidate(context, replace(acquisition, clock=_started(clock, first_slot, n)), fit, is_open)
 
 
-def _fit(initial: Reception, first_slot: int, packet_slots: int) -> float:
-    """`evidence.fit` of packets of some length that begin elsewhere."""
-    return evidence.fit(detected_on(initial, _started(initial.clock, first_slot, packet_slots)))
+def _begun(initial: Reception, first_slot: int, packet_slots: int) -> Reception:
+    """The initial pass with packets of some length that begin elsewhere."""
+    return detected_on(initial, _started(initial.clock, first_slot, packet_slots))
 
 
 def _started(clock: Clock, first_slot: int, packet_slots: int) -> Clock:

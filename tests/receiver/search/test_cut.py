@@ -103,5 +103,12 @@ def test_clocks_that_fit_no_better_than_light_without_slots_are_not_handed_on(mo
     found = sorted(cut._candidates(slots), key=lambda candidate: -candidate.fit)
     assert cut._distinct([replace(found[0], fit=-400.0), replace(found[-1], fit=-300.0)])[0].fit == -300.0
     assert cut._distinct([replace(found[0], fit=-400.0)]) == []
-    monkeypatch.setattr(cut, "_fit", lambda *_: -400.0)
-    assert list(cut._candidates(slots)) == []
+
+
+def test_a_header_in_the_middle_of_the_view_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng, shot = np.random.default_rng(7), Shot(8.0, 0.8, 89.0, 660, texture=0.5, texture_rows=9.0, crosstalk=0.1)
+    profiles = row_profiles(random_link(rng, [5] * 20, SCREEN.payload_symbols), shot, rng)
+    (slots,) = cut._slots_by(seen(monkeypatch, [profiles])[0])
+    best, *_ = cut._distinct(cut._candidates(slots))
+    clock = best.acquisition.clock
+    assert -clock.row0 / 8.0 + clock.first_slot == pytest.approx(89, abs=0.13)
