@@ -114,14 +114,15 @@ def _cameras(context: FrameContext) -> Iterable[FrameContext]:
 
 
 def _slots_by(context: FrameContext) -> Iterator[_Slots]:
-    """The slots by the first screen of a context, at their likeliest phase; none where they are too few."""
+    """The slots by the first screen of a context, at their likeliest phase; none where they are too few or too many."""
     screen, camera = context.screens[0], context.camera
     profiles = context.sample_columns(screen.columns)
     rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
     exposure_slots = camera.exposure_s * screen.slot_rate_hz
     top, bottom = sync.row_span(profiles)
     n_slots = int(np.ceil((bottom - top) / rows_per_slot)) + 1
-    if n_slots <= SETTINGS.cut_symbols * SLOTS_PER_SYMBOL or exposure_slots > LONG_EXPOSURE_SLOTS:
+    is_cut = n_slots < 2 * max(possible.packet_slots for possible in context.screens)  # else a whole packet is in view
+    if not is_cut or n_slots <= SETTINGS.cut_symbols * SLOTS_PER_SYMBOL or exposure_slots > LONG_EXPOSURE_SLOTS:
         return
     clock = Clock(
         rows_per_slot=rows_per_slot,
@@ -180,7 +181,7 @@ def _backwards(slots: _Slots) -> _Slots:
 def _candidates(slots: _Slots) -> Iterator[_Candidate]:
     """Starts of packets: at every phase of a symbol, and at the likeliest ones with a header in view."""
     clock = slots.acquisition.clock
-    for screen in slots.screens:
+    for screen in (screen for screen in slots.screens if clock.n_slots < 2 * screen.packet_slots):
         camera, n = relabelled_camera(slots.context.camera, screen, slots.context.frame), screen.packet_slots
         context = replace(slots.context, camera=camera, screens=(screen,))
         clock = replace(clock, exposure_slots=camera.exposure_s * screen.slot_rate_hz)

@@ -112,3 +112,14 @@ def test_a_header_in_the_middle_of_the_view_is_found(monkeypatch: pytest.MonkeyP
     best, *_ = cut._distinct(cut._candidates(slots))
     clock = best.acquisition.clock
     assert -clock.row0 / 8.0 + clock.first_slot == pytest.approx(89, abs=0.13)
+
+
+@pytest.mark.parametrize(("n_slots", "n_ways"), [(240, 1), (270, 0)])
+def test_no_part_of_a_packet_is_sought_where_a_whole_one_is_in_view(
+    n_slots: int, n_ways: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(6)
+    profiles = row_profiles(random_link(rng, [5] * 20, SCREEN.payload_symbols), Shot(4.0, 0.8, 33.0, 4 * n_slots), rng)
+    context = seen(monkeypatch, [profiles])[0]
+    camera = replace(context.camera, line_delay_s=2 * context.camera.line_delay_s)
+    assert len(list(cut._slots_by(replace(context, camera=camera)))) == n_ways
