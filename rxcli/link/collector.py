@@ -49,7 +49,10 @@ class Collector:
             receiver.placement = self._placement
             events += receiver.add(replace(likeliest, alternatives=tuple(less_likely)))
             self._placement = receiver.placement
-        return with_events(result if self._placement is None else placed(result, self._placement), events)
+        if self._placement is not None:
+            n_columns = len(result.columns) or (0 if soft is None else soft.llr.shape[2])
+            result = placed(result, self._placement, n_columns)
+        return with_events(result, events)
 
     def finish(self, last: FrameResult) -> FrameResult:
         """Add the remaining messages and files, complete or not, to the last result of the source."""

@@ -71,18 +71,18 @@ def _order(placement: Placement) -> tuple[bool, bool]:
     return placement.shift != 0, not placement.shift and placement.mirrored
 
 
-def placed(result: FrameResult, placement: Placement) -> FrameResult:
-    """Number the columns of a result as a decoded message shows; the numbers are then certain."""
+def placed(result: FrameResult, placement: Placement, n_columns: int) -> FrameResult:
+    """Number the `n_columns` columns of a screen as a decoded message shows; the numbers are then certain."""
     message = (result.message or "").replace(result.numbering_remark, "").rstrip("; ") or None
     certainty, shift = result.column_certainty, placement.shift
     result = result.with_columns_mirrored() if placement.mirrored else replace(result, mirrored=bool(result.mirrored))
-    columns, n_columns, corners = result.columns, len(result.columns), result.corners
+    columns, corners = result.columns, result.corners
     if certainty < 1:
         columns = tuple(replace(c, packets=tuple(_certain(p, certainty) for p in c.packets)) for c in columns)
     if shift and n_columns > 1:
         by_number = {c.column + shift: replace(c, column=c.column + shift) for c in columns}
         unread = [ColumnResult(number, "no_packet", message=_NOT_READ) for number in range(n_columns)]
-        columns = tuple(by_number.get(column.column, column) for column in unread)
+        columns = tuple(by_number.get(column.column, column) for column in unread) if columns else ()
         corners = None if corners is None else _moved(corners, -shift / n_columns)
     return replace(result, columns=columns, corners=corners, message=message, column_certainty=1.0, column_offset=0)
 

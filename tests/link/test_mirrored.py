@@ -59,6 +59,13 @@ def test_a_text_shows_how_the_columns_of_its_picture_lie(placement: Placement) -
     assert other.columns[9].packets[0].confidence == 0.4
 
 
+def test_the_outline_of_a_picture_without_packets_follows_its_text() -> None:
+    [soft, *_] = clip(message("hello"), 0, 1, np.random.default_rng(1))
+    got = Collector([SCREEN]).add(replace(result(soft, Placement(False, 2)), columns=()))
+    assert got.columns == ()
+    assert got.corners[0].tolist() == pytest.approx([-2, 0], abs=1e-4)
+
+
 def test_the_first_of_several_photos_is_not_tried_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     """It was tried alone before; with the second one it counts as ever."""
     add, tried, photos, rng = LinkReceiver.add, [], PhotoCollector([SCREEN]), np.random.default_rng(1)
