@@ -114,7 +114,7 @@ def _cameras(context: FrameContext) -> Iterable[FrameContext]:
 
 
 def _slots_by(context: FrameContext) -> Iterator[_Slots]:
-    """The slots by the first screen of a context, at their likeliest phase; none where they are too few or too many."""
+    """The slots by the first screen of a context at their likeliest phase, if it stands out and they are a part."""
     screen, camera = context.screens[0], context.camera
     profiles = context.sample_columns(screen.columns)
     rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
@@ -139,6 +139,8 @@ def _slots_by(context: FrameContext) -> Iterator[_Slots]:
     acquisition = Acquisition(screen, profiles, clock, (screen,))
     clocks = [replace(clock, row0=top - part * step) for part in range(n)]
     evidence_of = [log_evidence for _, log_evidence in slots_of_any_kind(acquisition, clocks)]
+    if np.ptp(evidence_of) < SETTINGS.cut_lead * n_slots:
+        return
     best = int(np.argmax(evidence_of))
     beside = peak_offset(*np.take(evidence_of, [best - 1, best, best + 1], mode="wrap"))
     clock = replace(clocks[best], row0=clocks[best].row0 - float(np.clip(beside, -0.5, 0.5)) * step)

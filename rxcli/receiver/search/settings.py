@@ -72,6 +72,8 @@ class SearchSettings:
     cut_fit: float = -350.0
     cut_fits: int = 3
     poor_lead: float = 16.0
+    #: Least log evidence of a slot against the unlikeliest phase: light without slots has 0.4, cut packets 18 and more.
+    cut_lead: float = 1.0
     #: Room light that is tried where no header is in view, relative to its estimate, which counts what is lit in part.
     cut_room_lights: tuple[float, ...] = (1.0, 0.8, 0.6)
     #: Natural logarithm of the ratio of exposures, stated and by the width of stripes, up to which they may agree.

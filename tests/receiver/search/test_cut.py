@@ -123,3 +123,16 @@ def test_no_part_of_a_packet_is_sought_where_a_whole_one_is_in_view(
     context = seen(monkeypatch, [profiles])[0]
     camera = replace(context.camera, line_delay_s=2 * context.camera.line_delay_s)
     assert len(list(cut._slots_by(replace(context, camera=camera)))) == n_ways
+
+
+@pytest.mark.parametrize(("lead", "n_ways"), [(0.5, 0), (2.0, 1)])
+def test_light_in_which_no_phase_of_slots_stands_out_is_not_read(
+    lead: float, n_ways: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(8)
+    profiles = row_profiles(random_link(rng, [5] * 20, SCREEN.payload_symbols), Shot(8.0, 0.8, 33.0, 560), rng)
+    lit = np.zeros((20, SCREEN.packet_slots), np.float32)
+    by_phase = [(lit, lead * 71 * number) for number in (0, 1, 0, 0)]
+    monkeypatch.setattr(cut, "slots_of_any_kind", lambda _, clocks: by_phase[: len(clocks)])
+    monkeypatch.setattr(Clock, "on_grid", lambda *_: lit)
+    assert len(list(cut._slots_by(seen(monkeypatch, [profiles])[0]))) == n_ways
