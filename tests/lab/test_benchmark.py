@@ -107,6 +107,8 @@ def test_numbers_of_columns_and_corners_are_compared(easy: Trial) -> None:
     (result,) = receive([easy.frame], easy.options())
     moved = replace(result, columns=tuple(replace(c, column=c.column + 2) for c in result.columns))
     assert (cases.column_shift(result, easy.truth), cases.column_shift(moved, easy.truth)) == (0, 2)
+    doubtful = replace(result, column_certainty=0.4, column_offset=None)
+    assert {"numbered": False, "certainty": 0.4}.items() <= cases._found(doubtful, case_of(easy)).items()
     truth = np.array([[0.0, 0], [100, 0], [100, 60], [0, 60]])
     found = np.roll(truth + np.array([[0, 0], [0, 3], [0, 0], [0, 1]]), 2, axis=0)
     assert cases.corner_error(found, truth) == pytest.approx(0.03)

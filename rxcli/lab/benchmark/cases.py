@@ -263,6 +263,7 @@ def _found(result: FrameResult, case: Case) -> Record:
         "corner_error": corner_error(found, truth) if found is not None and truth is not None else None,
         "shift": column_shift(result, case.truth) if case.truth is not None else 0,
         "numbered": result.column_offset is not None,
+        "certainty": result.column_certainty,
     }
 
 
