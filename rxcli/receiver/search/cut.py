@@ -181,7 +181,7 @@ def _backwards(slots: _Slots) -> _Slots:
 
 
 def _candidates(slots: _Slots) -> Iterator[_Candidate]:
-    """Starts of packets: at every phase of a symbol, and at the likeliest ones with a header in view."""
+    """Starts of packets: at every phase of a symbol, without and with a header in view."""
     clock = slots.acquisition.clock
     for screen in (screen for screen in slots.screens if clock.n_slots < 2 * screen.packet_slots):
         camera, n = relabelled_camera(slots.context.camera, screen, slots.context.frame), screen.packet_slots
@@ -193,10 +193,8 @@ def _candidates(slots: _Slots) -> Iterator[_Candidate]:
         # Packets of any length: longer by a symbol than what is in view, as the first one may begin before the picture.
         longer = clock.packet_slots + SLOTS_PER_SYMBOL
         without = [_begun(initial, PREAMBLE_SLOTS + phase, longer) for phase in range(SLOTS_PER_SYMBOL)]
-        # A header among them is the worst of all words, at the right phase as well.
-        likeliest = np.argsort([-found.column_llr.sum() for found in without])[: SETTINGS.cut_symbol_phases]
         starts: dict[int, tuple[float, bool]] = {}
-        for phase in likeliest.tolist():
+        for phase in range(SLOTS_PER_SYMBOL):
             for first_slot in range(phase, n, SLOTS_PER_SYMBOL):
                 # The last slot of the clock lies beyond the picture.
                 if first_slot < PREAMBLE_SLOTS or first_slot + clock.n_slots > n + 1:

@@ -58,18 +58,16 @@ class SearchSettings:
     #: Largest size of an outline relative to the picture, beyond which less than one column is visible.
     largest_outline: float = 50.0
 
-    #: Less than a packet in view: fewest symbols, phases of a slot that are tried, phases of a symbol at which headers
-    #: are sought, clocks that are handed on, log evidence by which a start with a part of the header in view must lead,
-    #: least log-likelihood ratio of a column, least fit of a clock: noise has 20 times that of a column; fits of
-    #: outline and camera; lead a slot below which a camera profile may be wrong: by right ones pictures reach 22 to 51,
-    #: by ones that are 1 % off 8 to 14.
+    #: Less than a packet in view: fewest symbols, phases of a slot that are tried, clocks that are handed on, log
+    #: evidence by which a start with a part of the header in view must lead, least log-likelihood ratio of a column, and
+    #: least fit of a clock: noise has 20 times that of a column; fits of outline and camera; lead a slot below which a
+    #: camera profile may be wrong: by right ones pictures reach 22 to 51, by ones that are 1 % off 8 to 14.
     cut_symbols: int = 2
     cut_phases: int = 4
-    cut_symbol_phases: int = 4
     max_cut: int = 4
     cut_start: float = 10.0
-    worst_fit: float = -20.0
-    cut_fit: float = -350.0
+    worst_fit: float = -60.0
+    cut_fit: float = -1050.0
     cut_fits: int = 3
     poor_lead: float = 16.0
     #: Least log evidence of a slot against the unlikeliest phase: light without slots has 0.4, cut packets 18 and more.

@@ -19,6 +19,7 @@ from rxcli.receiver.frame.result import Received
 from rxcli.receiver.frame.timer import Timer
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import cut
+from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
 from rxcli.types import Clock, Frame, FrameResult, FrameSoftBits, RowProfiles, SearchStep
 
@@ -101,8 +102,9 @@ def test_clocks_that_fit_no_better_than_light_without_slots_are_not_handed_on(mo
     profiles = row_profiles(random_link(rng, [5] * 20, SCREEN.payload_symbols), shot, rng)
     (slots,) = cut._slots_by(seen(monkeypatch, [profiles])[0])
     found = sorted(cut._candidates(slots), key=lambda candidate: -candidate.fit)
-    assert cut._distinct([replace(found[0], fit=-400.0), replace(found[-1], fit=-300.0)])[0].fit == -300.0
-    assert cut._distinct([replace(found[0], fit=-400.0)]) == []
+    poor, better = replace(found[0], fit=SETTINGS.cut_fit - 50), replace(found[-1], fit=SETTINGS.cut_fit + 50)
+    assert cut._distinct([poor, better]) == [better]
+    assert cut._distinct([poor]) == []
 
 
 def test_a_header_in_the_middle_of_the_view_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
