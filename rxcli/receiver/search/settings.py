@@ -60,8 +60,8 @@ class SearchSettings:
 
     #: Less than a packet in view: fewest symbols, phases of a slot that are tried, clocks that are handed on, log
     #: evidence by which a start with a part of the header in view must lead, least log-likelihood ratio of a column,
-    #: and least fit of a clock: noise has 20 times that of a column; fits of outline and camera; lead a slot below which
-    #: a camera profile may be wrong: by right ones pictures reach 22 to 51, by ones that are 1 % off 8 to 14.
+    #: and least fit of a clock: noise has 20 times that of a column; fits of outline and camera; lead a slot below
+    #: which a camera profile may be wrong: by right ones pictures reach 22 to 51, by ones that are 1 % off 8 to 14.
     cut_symbols: int = 2
     cut_phases: int = 4
     max_cut: int = 4
