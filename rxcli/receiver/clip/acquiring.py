@@ -9,6 +9,7 @@ its texture as well, which is what it has in common with the frames after it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -71,41 +72,42 @@ class HiddenFrames:
         return frames
 
     def _without_texture(self, camera: ClipCamera) -> FirstFrames | None:
-        """What the first frame shows without its texture: the surest camera of some frames, and their median outline.
+        """What the first frame shows without its texture: surest camera and median outline of some that agree.
 
         None where it shows no packets.
         """
-        n_frames, shown = len(self.frames), dict[int, Located]()
         flat = FrameCache(self._flat(0))
         if not shows_same(self.frames[0], flat.frame, DEFAULT_TONE):
             return None
-        for number in (0, n_frames // 2, n_frames - 1):
+        alone = self.alone if isinstance(self.alone, Located) and self.alone.shows_packets else None
+        shown = [Place.of(alone)] if alone is not None and alone.is_long and not alone.is_bent else []
+        agreed: list[Place] = []
+        for share in SETTINGS.searched_frames:
+            number = int(share * len(self.frames)) - int(share == 1)
             found = camera.locate(FrameCache(self._flat(number)) if number else flat, may_bend=False)
             if isinstance(found, Located) and self._was_hidden(found):
-                shown[number] = found
-            elif isinstance(self.alone, Located) and self.alone.shows_packets and not self.alone.is_long:
+                shown.append(Place.of(found, self._motion(number)))
+                agreed = agreeing(shown)
+            elif alone is not None and not alone.is_long:
                 break
-        if not shown:
+            if len(agreed) > 1 and len(shown) > SETTINGS.few_frames:
+                break
+        if not agreed:
             return None
-        surest = max(shown, key=lambda number: shown[number].evidence)
-        outline = self._agreed({number: each.outline for number, each in shown.items()}, surest, camera)
-        best = shown[surest]
+        surest = max(agreed, key=lambda place: place.located.evidence)
+        best, corners = surest.located, surest.corners
         assert isinstance(best.found, Found)
-        alone = replace(camera, context=best.context).locate(flat, [outline], may_bend=False)
-        if isinstance(alone, Located) and self._was_hidden(alone):
-            return FirstFrames(self.frames, alone)
-        there = replace(best.context, cache=flat, sampled_corners=outline.corners)
-        located = Located(outline, there, None, best.framing)
-        return FirstFrames(self.frames, located, start=start_by(best.found, self.frames))
-
-    def _agreed(self, outlines: dict[int, Outline], surest: int, camera: ClipCamera) -> Outline:
-        """The median of outlines of some frames, where it is in the first; of two the surest."""
-        outline = outlines[surest]
         if camera.options.corners is not None:  # They hold for every frame.
-            return replace(outline, strips=None, grid=None)
-        corners = {number: each.corners - self._motion(number) for number, each in outlines.items()}
-        agreed = np.median(list(corners.values()), axis=0) if len(corners) > 2 else corners[surest]
-        return replace(outline, corners=agreed, strips=None, grid=None)
+            corners = best.outline.corners
+        elif len(agreed) > 2:
+            corners = np.median([each.corners for each in agreed], axis=0)
+        outline = replace(best.outline, corners=corners, strips=None, grid=None)
+        there = replace(camera, context=best.context).locate(flat, [outline], may_bend=False)
+        if isinstance(there, Located) and self._was_hidden(there) and Place.of(there).agrees(surest):
+            return FirstFrames(self.frames, there)
+        context = replace(best.context, cache=flat, sampled_corners=outline.corners)
+        located = Located(outline, context, None, best.framing)
+        return FirstFrames(self.frames, located, start=start_by(best.found, self.frames))
 
     def _was_hidden(self, located: Located) -> bool:
         """Whether packets were found that the texture had hidden."""
@@ -119,6 +121,34 @@ class HiddenFrames:
     def _motion(self, number: int) -> FloatArray:
         """(2,) pixels by which the screen moves from the first frame to another one."""
         return shift_of_texture(self.frames[0], self.frames[number], DEFAULT_TONE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """What a frame shows, and where the screen of it is in the first frame."""
+
+    corners: FloatArray
+    located: Located
+
+    @classmethod
+    def of(cls, located: Located, motion: FloatArray | float = 0.0) -> Place:
+        """From the motion of the screen since the first frame."""
+        return cls(located.outline.corners - motion, located)
+
+    def agrees(self, place: Place) -> bool:
+        """Whether both have the same columns, read at the same slot rate and in the same direction."""
+        cameras = [each.located.context.camera for each in (self, place)]
+        screens = [each.located.context.screens[0] for each in (self, place)]
+        if len({(camera.reversed, screen.slot_rate_hz) for camera, screen in zip(cameras, screens, strict=True)}) > 1:
+            return False
+        column = float(np.ptp(self.corners[:, 0])) / screens[0].columns
+        return float(np.abs(self.corners - place.corners)[:, 0].max()) < column
+
+
+def agreeing(places: Sequence[Place]) -> list[Place]:
+    """The places that agree with a common one, of the largest evidence together."""
+    groups = ([place for place in places if place.agrees(centre)] for centre in places)
+    return max(groups, key=lambda group: sum(place.located.evidence for place in group))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,9 +13,10 @@ import numpy as np
 
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
+from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.clip.acquiring import FirstFrames, HiddenFrames
 from rxcli.receiver.clip.camera import Acquired, ClipCamera, Located
-from rxcli.receiver.clip.common_clock import common_clock
+from rxcli.receiver.clip.common_clock import common_clock, start_by
 from rxcli.receiver.clip.ledger import Ledger
 from rxcli.receiver.clip.scene import TrackedScreen, by_copy_metrics
 from rxcli.receiver.clip.settings import SETTINGS
@@ -26,6 +27,7 @@ from rxcli.receiver.frame.passes import Reception, shows_steady_light
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.light import slot_llr
 from rxcli.receiver.screen.outline import Outline
+from rxcli.receiver.search import Found
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode
@@ -164,6 +166,8 @@ def _receive_first(known: Known, held: FirstFrames) -> _Step:
     located = held.agreed()
     if held.start is not None:
         known.ledger.start = held.start
+    elif len(held.frames) > 1 and isinstance(found := held.located.found, Found) and _hides_headers(found):
+        known.ledger.start = start_by(found, held.frames)
     elif len(held.frames) > 1 and held.shows_little:
         agreed = common_clock(held.frames, located.context, known.camera.options.screens)
         if agreed is not None:
@@ -174,6 +178,11 @@ def _receive_first(known: Known, held: FirstFrames) -> _Step:
         after, more = _receive(after, frame)
         results += more
     return after, results
+
+
+def _hides_headers(found: Found) -> bool:
+    """Whether exposures are so long that the light itself does not show where a header is."""
+    return found.best.reception.clock.exposure_slots > SLOTS_PER_SYMBOL / 2
 
 
 # -- one frame ---------------------------------------------------------------------------------------------------------

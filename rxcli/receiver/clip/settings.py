@@ -50,6 +50,10 @@ class ClipSettings:
 
     #: First frames whose mean shows the texture of the picture, and little of their slots.
     n_for_texture: int = 16
+    #: Which of them are searched without it, from the first to the last, until more than a few show packets and two of
+    #: these agree.
+    searched_frames: tuple[float, ...] = (0.0, 0.5, 1.0, 0.25, 0.75, 0.125)
+    few_frames: int = 2
     #: First frames whose outlines are compared. First frames that are taken together: for the clock where each shows
     #: little, for the phase of the bursts and for the picture; number where these leave doubt; and share of well lit
     #: packets in doubt.
