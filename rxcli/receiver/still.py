@@ -275,7 +275,7 @@ def follow_picture(
         clock = reception.clock
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), q, ratios.by_start(clock))
     lit = clock.on_grid(reception.posteriors.lit)
-    if not reception.is_long:
+    if acquisition.profiles.has_row_noise and not reception.is_long:
         samples = denoise.remove_row_noise(samples, ratios.whole_light(lit, clock, model.crosstalk, q), model)
     bursts = ratios.burst_samples(samples, clock, model, columns, lit)
     if not reception.is_long:

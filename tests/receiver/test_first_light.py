@@ -31,7 +31,8 @@ def slots_of(numbers: list[int]) -> NDArray[np.float64]:
 
 
 def received(slots: NDArray[np.float64], n_frames: int, *, known: bool, corners: bool = False) -> list[FrameResult]:
-    scene = preset("phone-plain" if n_frames == 1 else "video-1080p", SCREEN).scaled(0.6 if n_frames == 1 else 0.5, 1.0)
+    # A photograph's pixels stay square: without borders of columns, the aspect tells the screen from a window.
+    scene = preset("phone-plain" if n_frames == 1 else "video-1080p", SCREEN).scaled(1.0 if n_frames == 1 else 0.5, 1.0)
 
     def light(slot: NDArray[np.float64]) -> NDArray[np.float64]:
         return slots[:, np.maximum(slot, 0).astype(int) % slots.shape[1]]

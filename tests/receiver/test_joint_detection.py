@@ -62,8 +62,7 @@ def test_noise_of_rows_is_taken_off_by_the_slots_of_all_columns() -> None:
         profiles = replace(acquisition.profiles, level=None, has_row_noise=has_row_noise)
         found = decode(replace(acquisition, profiles=profiles), frozenset(), first)
         wrong.append(np.mean((found.posteriors.lit[0] > 0.5) != (sent > 0.5)))
-    assert wrong[1] < 0.5 * wrong[0]
-    assert wrong[2] < wrong[1]
+    assert wrong[2] < 0.5 * wrong[0] < wrong[1]
 
 
 @pytest.mark.parametrize("late", [-0.2, 0.0, 0.15])
