@@ -14,14 +14,17 @@ from rxcli.options import ReceiverOptions
 from rxcli.receiver.clip.camera import ClipCamera, Located
 from rxcli.receiver.clip.common_clock import start_by
 from rxcli.receiver.clip.ledger import Ledger
+from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.views import Waiting
 from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.plane import without_texture
 from rxcli.receiver.receive import receive
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, cameras
 from rxcli.receiver.search.outlines import possible_screens
+from rxcli.receiver.still import decode
 from rxcli.results.truth import Truth
 from rxcli.types import Frame, FrameResult, Metadata
 from tests.receiver.test_video import Clip, scored, simulate
@@ -52,6 +55,31 @@ def test_a_clip_of_long_exposures_is_received(exposure_slots: float) -> None:
     assert score.error_free >= 0.75 * score.expected > 60
     believed = [p for result in results for p in result.packets if p.confidence >= 0.9]
     assert sum(p.bit_errors != 0 for p in believed) <= 0.03 * len(believed)
+
+
+@pytest.mark.parametrize("exposure_slots", [1.0, 2.0])
+def test_frames_that_decide_picture_and_slots_together_are_measured_twice(
+    exposure_slots: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The picture of few frames leaves wrong slots that look sure; a frame received alone decides jointly, too."""
+    adds_up, measured = list[bool](), list[bool]()
+    measure_again = TrackedScreen.measure_again
+
+    def decoded(*given: Any, **how: bool) -> Reception:
+        adds_up.append(how["adds_up"])
+        return decode(*given, **how)
+
+    def noted(scene: TrackedScreen, views: Any, known: Any, doubtful: list[bool]) -> None:
+        measured.append(all(doubtful))
+        measure_again(scene, views, known, doubtful)
+
+    monkeypatch.setattr("rxcli.receiver.clip.receiver.decode", decoded)
+    monkeypatch.setattr(TrackedScreen, "measure_again", noted)
+    clip = simulate(8, 9, picture="grey", exposure_slots=exposure_slots, height_scale=1.0)
+    assert len(list(receive(clip.frames, clip.options))) == 9
+    is_joint = exposure_slots > 1.7
+    assert set(adds_up) == {not is_joint}
+    assert measured == [True] * (1 + is_joint)
 
 
 @pytest.fixture(scope="module")

@@ -162,21 +162,25 @@ class Ledger:
     def _measure_again(self, *, at_last: bool = False) -> None:
         """Measure the first frames once more: by then it is known better what is on the screen.
 
-        The picture is learned anew from all of them, and doubtful ones are measured with the picture of the others.
-        Where that leaves doubt, more frames are waited for, unless it is `at_last` or results are wanted promptly.
+        The picture is learned anew from all of them, and doubtful ones are measured with the picture of the others,
+        as are all whose slots were detected jointly with it. Where that leaves doubt, more frames are waited for,
+        unless it is `at_last` or results are wanted promptly.
         """
         views, scene = self._views, self._scene
         held = [] if scene is None else [view for view in views if scene.can_measure_again(view)]
         if scene is not None and len(held) > 1:
             lit = [lit_slots(view, self._open(view)) for view in held]
             is_first = self._n_held == self._n_first
-            scene.measure_again(held, lit, [is_first or doubts(view, self._open(view))[0] > 0 for view in held])
+            needed = [is_first or bool(view.joint) or doubts(view, self._open(view))[0] > 0 for view in held]
+            scene.measure_again(held, lit, needed)
             self._bursts = {}
             for view in views:
                 self._add_bursts(view)
         n_doubtful, n_packets = np.sum([(0, 0), *(doubts(view, self._open(view)) for view in held)], axis=0)
         may_wait = self._n_held == self._n_first and not at_last and not self._options.prompt
-        self._n_held = SETTINGS.frames_in_doubt if may_wait and n_doubtful > SETTINGS.much_doubt * n_packets else 0
+        # Slots that were detected jointly with a picture of few frames may be wrong, however sure.
+        is_open = n_doubtful > SETTINGS.much_doubt * n_packets or any(view.joint for view in held)
+        self._n_held = SETTINGS.frames_in_doubt if may_wait and is_open else 0
 
     # -- results go out ------------------------------------------------------------------------------------------------
 

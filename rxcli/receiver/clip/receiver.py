@@ -279,7 +279,7 @@ def _receive_anew(
         return Lost(known), acquired, None
     options, acquisition = camera.options, acquired.acquisition
     with timer("detect"):
-        reception = decode(acquisition, options.skip, acquired.initial, adds_up=True)
+        reception = decode(acquisition, options.skip, acquired.initial, adds_up=not _is_joint(acquired.initial))
     with timer("denoise"):
         reception, denoised, report = apply_autoencoder(acquisition, reception, options)
     # Of long exposures packets were compared with arbitrary slots already.
