@@ -1,5 +1,6 @@
 """Floors on the reference clips beside the checkout: pictures that the project's own simulator did not make."""
 
+import math
 from itertools import islice
 from pathlib import Path
 
@@ -26,8 +27,8 @@ def test_clips_of_long_exposures(shared_captures: Path, name: str, n_frames: int
     packets = [packet for result in results for packet in result.packets]
     assert sum(right(packet) for packet in packets) >= least
     believed = [packet for packet in packets if packet.confidence >= 0.9]
-    # The confidence is fitted on simulated clips; of this one's six slots 3.5 % are wrong where 0.8 % are foreseen.
-    assert np.mean([not right(packet) for packet in believed]) <= 0.045
+    doubt = sum(1 - packet.confidence for packet in believed)  # as many may be wrong, and two deviations more
+    assert sum(not right(packet) for packet in believed) <= doubt + 2 * math.sqrt(doubt)
 
 
 #: Of the 4K clip's starved frames, slots given, 464 to 473 packets come out: docs/video.md.

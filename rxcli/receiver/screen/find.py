@@ -208,15 +208,14 @@ def wide_grids(strips: PictureStrips, sigma: float, rivals: Sequence[Grid] = (),
     ahead = [_OF_PART * any(grid is rival for rival in rivals) for grid in starts]
     near = [moved_by_waveforms(some, grid, sigma, _FIRST_STEPS) for grid in starts]
     fitted = [with_light(strips, moved_by_waveforms(strips, grid, sigma, _LAST_STEPS), sigma) for grid in near]
-    scored = [(_score(grid) + more, more, grid) for grid, more in zip(fitted, ahead, strict=True)]
-    scored = sorted((own for own in scored if _stands_out(strips, own[2], least)), key=lambda own: -own[0])
+    scored = [(_score(grid) + more, grid) for grid, more in zip(fitted, ahead, strict=True)]
+    scored = sorted((own for own in scored if _stands_out(strips, own[1], least)), key=lambda own: -own[0])
     if not scored:
         return []
-    score, _, likeliest = scored[0]
-    # Of grids with the same columns, that of a part, then the likeliest is nearest to them.
-    same = [(more, _likelihood(grid), grid) for _, more, grid in scored if not _differ(strips, grid, likeliest)]
-    best = max(same, key=lambda own: own[:2])[2]
-    second = [grid for own, _, grid in scored if own >= score - _NEARLY_BEST and _differ(strips, grid, likeliest)]
+    score, likeliest = scored[0]
+    # Of grids with the same columns the likeliest is nearest to them.
+    best = max((grid for _, grid in scored if not _differ(strips, grid, likeliest)), key=_likelihood)
+    second = [grid for own, grid in scored if own >= score - _NEARLY_BEST and _differ(strips, grid, likeliest)]
     return [best, *second[:1]]
 
 
