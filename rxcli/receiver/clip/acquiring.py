@@ -79,19 +79,7 @@ class HiddenFrames:
         flat = FrameCache(self._flat(0))
         if not shows_same(self.frames[0], flat.frame, DEFAULT_TONE):
             return None
-        alone = self.alone if isinstance(self.alone, Located) and self.alone.shows_packets else None
-        shown = [Place.of(alone)] if alone is not None and alone.is_long and not alone.is_bent else []
-        agreed: list[Place] = []
-        for share in SETTINGS.searched_frames:
-            number = int(share * len(self.frames)) - int(share == 1)
-            found = camera.locate(FrameCache(self._flat(number)) if number else flat, may_bend=False)
-            if isinstance(found, Located) and self._was_hidden(found):
-                shown.append(Place.of(found, self._motion(number)))
-                agreed = agreeing(shown)
-            elif alone is not None and not alone.is_long:
-                break
-            if len(agreed) > 1 and len(shown) > SETTINGS.few_frames:
-                break
+        agreed = self._places_that_agree(camera, flat)
         if not agreed:
             return None
         surest = max(agreed, key=lambda place: place.located.evidence)
@@ -108,6 +96,23 @@ class HiddenFrames:
         context = replace(best.context, cache=flat, sampled_corners=outline.corners)
         located = Located(outline, context, None, best.framing)
         return FirstFrames(self.frames, located, start=start_by(best.found, self.frames))
+
+    def _places_that_agree(self, camera: ClipCamera, flat: FrameCache) -> list[Place]:
+        """What some frames show without their texture and agree on; `flat` is the first of them so."""
+        alone = self.alone if isinstance(self.alone, Located) and self.alone.shows_packets else None
+        shown = [Place.of(alone)] if alone is not None and alone.is_long and not alone.is_bent else []
+        agreed: list[Place] = []
+        for share in SETTINGS.searched_frames:
+            number = int(share * len(self.frames)) - int(share == 1)
+            found = camera.locate(FrameCache(self._flat(number)) if number else flat, may_bend=False)
+            if isinstance(found, Located) and self._was_hidden(found):
+                shown.append(Place.of(found, self._motion(number)))
+                agreed = agreeing(shown)
+            elif alone is not None and not alone.is_long:
+                break
+            if len(agreed) > 1 and len(shown) > SETTINGS.few_frames:
+                break
+        return agreed
 
     def _was_hidden(self, located: Located) -> bool:
         """Whether packets were found that the texture had hidden."""
@@ -137,11 +142,10 @@ class Place:
 
     def agrees(self, place: Place) -> bool:
         """Whether both have the same columns, read at the same slot rate and in the same direction."""
-        cameras = [each.located.context.camera for each in (self, place)]
-        screens = [each.located.context.screens[0] for each in (self, place)]
-        if len({(camera.reversed, screen.slot_rate_hz) for camera, screen in zip(cameras, screens, strict=True)}) > 1:
+        own, given = self.located.context, place.located.context
+        if own.camera.reversed != given.camera.reversed or own.screens[0].slot_rate_hz != given.screens[0].slot_rate_hz:
             return False
-        column = float(np.ptp(self.corners[:, 0])) / screens[0].columns
+        column = float(np.ptp(self.corners[:, 0])) / own.screens[0].columns
         return float(np.abs(self.corners - place.corners)[:, 0].max()) < column
 
 

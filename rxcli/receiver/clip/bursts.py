@@ -11,7 +11,7 @@ import numpy as np
 from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver import channel
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.clip.views import View
+from rxcli.receiver.clip.views import View, decides_jointly
 from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.frame.settings import SETTINGS as pass_settings
 from rxcli.receiver.light import slot_llr
@@ -73,8 +73,10 @@ class Burst:
             against = np.maximum(-self._llr[0, :, PREAMBLE_SLOTS:] * decided, 0).max(axis=1)
         else:
             margin = detect.slot_margin(self.metrics[None], self.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
-            is_joint = view.acquisition.clock.exposure_slots > SETTINGS.joint_slots
-            undenoised, joint = np.zeros(margin.shape[1], bool), np.full(margin.shape[1], is_joint)
+            undenoised, joint = (
+                np.zeros(margin.shape[1], bool),
+                np.full(margin.shape[1], decides_jointly(view.acquisition.clock)),
+            )
             n_strips = view.acquisition.binned.light.shape[1]
             features = confidence.confidence_features(self.posteriors, margin, undenoised, n_strips, joint)[0]
         index = self.number - int(view.numbers[0])

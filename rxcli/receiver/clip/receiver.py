@@ -20,7 +20,7 @@ from rxcli.receiver.clip.common_clock import common_clock, start_by
 from rxcli.receiver.clip.ledger import Ledger
 from rxcli.receiver.clip.scene import TrackedScreen, by_copy_metrics
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.clip.views import JointSlots, View, Waiting
+from rxcli.receiver.clip.views import JointSlots, View, Waiting, decides_jointly
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.passes import Reception, shows_steady_light
@@ -278,8 +278,9 @@ def _receive_anew(
     if isinstance(acquired, Failure):
         return Lost(known), acquired, None
     options, acquisition = camera.options, acquired.acquisition
+    is_joint = decides_jointly(acquired.initial.clock)
     with timer("detect"):
-        reception = decode(acquisition, options.skip, acquired.initial, adds_up=not _is_joint(acquired.initial))
+        reception = decode(acquisition, options.skip, acquired.initial, adds_up=not is_joint)
     with timer("denoise"):
         reception, denoised, report = apply_autoencoder(acquisition, reception, options)
     # Of long exposures packets were compared with arbitrary slots already.
@@ -292,12 +293,12 @@ def _receive_anew(
         acquired.context,
         acquisition,
         _bursts_of(frame, reception),
-        1 if _is_joint(reception) else reception.model.exposure.isi_memory,
+        1 if is_joint else reception.model.exposure.isi_memory,
         frame.height,
         reception.snr,
         denoised,
         framing=framing_of(acquisition, acquired.initial, acquired.screens),
-        joint=JointSlots.of(reception.clock, reception.posteriors) if _is_joint(reception) else None,
+        joint=JointSlots.of(reception.clock, reception.posteriors) if is_joint else None,
     )
     if not _can_track(acquired, options):
         return Lost(known), view, report
@@ -319,14 +320,9 @@ def _can_track(acquired: Acquired, options: ReceiverOptions) -> bool:
     )
 
 
-def _is_joint(reception: Reception) -> bool:
-    """Whether the frames of a clip like this one decide slots and what is not known of the picture together."""
-    return reception.clock.exposure_slots > SETTINGS.joint_slots
-
-
 def _bursts_of(frame: Frame, reception: Reception) -> tracking.FrameBursts:
     shown = np.minimum(assemble.slots_observed(reception.samples, reception.clock.by_copy), 1)
     metrics = reception.metrics
-    if _is_joint(reception):
+    if decides_jointly(reception.clock):
         metrics = by_copy_metrics(np.asarray(0.5 + 0.5 * np.tanh(slot_llr(metrics) / 2), np.float32))
     return tracking.FrameBursts(frame.index, 0, reception.clock, metrics, shown)

@@ -15,7 +15,7 @@ from rxcli.receiver.channel import ObservationModel, SlotLikelihoods, known_pict
 from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.timeline import Timeline
-from rxcli.receiver.clip.views import JointSlots, Pose, View
+from rxcli.receiver.clip.views import JointSlots, Pose, View, decides_jointly
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
@@ -110,7 +110,7 @@ class TrackedScreen:
             clock = self._clock(frame, columns, last.acquisition.clock, timeline.time)
         if clock is None:
             return None
-        if clock.exposure_slots > SETTINGS.joint_slots:
+        if decides_jointly(clock):
             bursts, observed = timeline.assigned(frame, clock), _Observed(pose.rows, light, columns, 1)
             return self._long_view(cache, observed, picture, clock, bursts, max_misfit)
         with timer("detect"):
@@ -222,7 +222,7 @@ class TrackedScreen:
 
         contrast, clock = with_contrast(0.0)
         # Of long exposures headers are too faint to place the clock; evidence does, see `lateness`.
-        is_known = time.is_measured and old.exposure_slots > SETTINGS.joint_slots
+        is_known = time.is_measured and decides_jointly(old)
         if contrast < SETTINGS.good_header and not is_known:
             slots = np.arange(-time.sure_slots, time.sure_slots + SETTINGS.clock_step, SETTINGS.clock_step)
             best = max(map(with_contrast, slots.tolist()), key=itemgetter(0))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from rxcli.receiver.channel.known_picture import ColumnLight
+from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.plane import tracked
@@ -30,6 +31,11 @@ class Pose:
     def rows(self) -> FloatArray:
         """(R,) sensor rows that are read."""
         return self.map.rows
+
+
+def decides_jointly(clock: Clock) -> bool:
+    """Whether exposures are so long that slots and what is not known of the picture are decided together."""
+    return clock.exposure_slots > SETTINGS.joint_slots
 
 
 @dataclass(frozen=True, slots=True, eq=False)
