@@ -92,10 +92,12 @@ def test_the_program_plays_every_slot_in_time_in_an_emulator(tmp_path: Path, scr
     flags = ["-std=c11", "-Wall", "-Werror", "-Os", "-mmcu=atmega328p", "-DF_CPU=16000000UL"]
     subprocess.run(["avr-gcc", *flags, "player.c", "trace.c", "-o", "player.elf"], cwd=tmp_path, check=True)
     with subprocess.Popen(["simavr", "player.elf"], cwd=tmp_path, stdout=subprocess.DEVNULL) as emulator:
-        try:
-            emulator.wait(1)
-        except subprocess.TimeoutExpired:
-            emulator.terminate()
+        for end in (emulator.terminate, emulator.kill):  # It may wait for itself on its way out.
+            try:
+                emulator.wait(1)
+                break
+            except subprocess.TimeoutExpired:
+                end()
     state, time, states, latches_s = 0, 0, [], []
     for change in (tmp_path / "pins.vcd").read_text().splitlines():
         if change[:1] == "#" and change[1:].isdigit():
