@@ -117,12 +117,10 @@ def _steps(result: FrameResult) -> list[tuple[str, bool]]:
 
 def _inspection(known: Inspection) -> dict[str, Any]:
     n_points = _FEW_POINTS if len(known.traces) > _MANY_COLUMNS else _POINTS
-    residuals = [trace.residuals for trace in known.traces if trace.residuals is not None]
     return {
-        **{name: getattr(known, name) for name in ("rows_per_slot", "histogram", "eye", "crosstalk")},
+        **{name: getattr(known, name) for name in ("rows_per_slot", "histogram", "eye", "residuals", "crosstalk")},
         "traces": [_trace(trace, n_points) for trace in known.traces],
-        "received": any(trace.borders for trace in known.traces),
-        "residuals": np.concatenate(residuals) if residuals else [],
+        "received": any(trace.borders.size for trace in known.traces),
     }
 
 

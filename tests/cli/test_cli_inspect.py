@@ -120,7 +120,7 @@ def test_what_is_measured_agrees_with_what_was_sent(tmp_path: Path) -> None:
     assert known.rows_per_slot == pytest.approx(ROWS_PER_SLOT)
     np.testing.assert_allclose(known.crosstalk[:, 1], 1, atol=0.1)
     assert np.nanmax(np.abs(known.crosstalk[:, [0, 2]])) < 0.1
-    late = np.concatenate([trace.residuals[:, 1] for trace in known.traces if trace.residuals is not None])
+    late = known.residuals[:, 1]
     assert late.size >= N_COLUMNS
     assert np.abs(late).max() < 0.15
     dark, lit = known.histogram
