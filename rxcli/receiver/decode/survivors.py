@@ -11,7 +11,7 @@ Trans. Commun. 48(10), 2000).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -40,6 +40,8 @@ _NEVER = -1e9
 _RECENT, _WORD = (1 << 2 * SLOTS_PER_SYMBOL) - 1, (1 << SLOTS_PER_SYMBOL) - 1
 #: Books of words: header, codebooks by weight, dimming symbols, arbitrary slots.
 _HEADER, _DIMMING, _ARBITRARY = 0, len(WEIGHTS) + 1, len(WEIGHTS) + 2
+#: Of each word in order: posterior, weight and slots of the paths, (lanes, paths) each.
+_Words = list[tuple[FloatArray, IntArray, IntArray]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +73,11 @@ class _Paths:
         """The paths with the given numbers, (lanes, n), or (n,) of every lane."""
         lanes, n_paths = self.w.shape
         place = index + n_paths * np.arange(lanes)[:, None]
-        every = (getattr(self, field.name) for field in fields(self))
-        return _Paths(*(values.reshape(-1, *values.shape[2:]).take(place, axis=0) for values in every))
+        of_paths = [values.take(place) for values in (self.slots, self.w, self.log_likelihood)]
+        of_strips = [
+            values.reshape(-1, values.shape[2]).take(place, axis=0) for values in (self.picture, self.variance)
+        ]
+        return _Paths(*of_paths, *of_strips)
 
 
 def detect(
@@ -82,30 +87,50 @@ def detect(
 
     With `has_common_weights` the weights of all columns are the prior of each.
     """
-    n_bursts, n_columns = samples.n_bursts, samples.n_columns
-    paths, steps, ends = _forward(samples, settings, is_free=False)
-    words = _backward(steps, ends, np.zeros_like(paths.log_likelihood))
+    n_bursts, n_columns, n_slots = samples.n_bursts, samples.n_columns, samples.light.shape[0]
+    # A burst without a word in view is followed up to them: its paths would be as many as there may be.
+    reach = exposed_from(samples.exposure_slots, samples.light.shape[1]).shape[1] - 1
+    shows_words = (samples.valid[PREAMBLE_SLOTS - reach :] > 0).any(axis=(0, 1, 3))
+    followed: list[tuple[IntArray, _Words]] = []
+    w_log_prob, evidence = np.empty((shows_words.size, len(WEIGHTS))), np.empty(shows_words.size)
+    for shown, n_followed in ((shows_words, n_slots), (~shows_words, PREAMBLE_SLOTS)):
+        if (lanes := np.flatnonzero(shown)).size:
+            paths, steps, ends = _forward(part := _part(samples, lanes, n_followed), settings, is_free=False)
+            words = _backward(steps, ends, np.zeros_like(paths.log_likelihood))
+            followed.append((lanes, words))
+            w_log_prob[lanes] = _weight_log_prob(*(words or [_posterior(paths)])[0])
+            evidence[lanes] = _log_evidence(paths, part, settings)
     # One weight for all bursts of a column.
-    w_log_prob = _weight_log_prob(*words[0]).reshape(n_bursts, n_columns, -1).sum(axis=0)
+    w_log_prob = w_log_prob.reshape(n_bursts, n_columns, -1).sum(axis=0)
     w_log_prob = w_log_prob - np.logaddexp.reduce(w_log_prob, axis=1, keepdims=True)
     common = np.log(weight_shares(w_log_prob)) if has_common_weights else 0.0
     w = (w_log_prob + common).argmax(axis=1) + 1
-    shape = (n_bursts, n_columns, len(words))
-    lit = np.empty((n_bursts, n_columns, samples.light.shape[0]), np.float32)
+    shape = (n_bursts, n_columns, n_slots // SLOTS_PER_SYMBOL - PREAMBLE_SLOTS // SLOTS_PER_SYMBOL)
+    lit = np.empty((n_bursts, n_columns, n_slots), np.float32)
     index, log_prob = np.zeros(shape, np.int64), np.zeros(shape)
     bit_llr = np.full((*shape, 7), np.nan)
     for weight in np.unique(w).tolist():
         columns = np.flatnonzero(w == weight)
-        posterior = _word_posteriors(words, weight, (n_bursts, n_columns))[:, columns]
+        posterior = _word_posteriors(followed, weight, shape)[:, columns]
         lit[:, columns, :PREAMBLE_SLOTS] = preamble_slots(weight)
         lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(weight)).reshape(n_bursts, columns.size, -1)
         index[:, columns] = best = posterior.argmax(axis=-1)
         log_prob[:, columns] = log_of_best(posterior, best)
         n_bits = bits_per_symbol(weight)
         bit_llr[:, columns, :, :n_bits] = llr_of_bits(posterior, n_bits)
-    evidence = _log_evidence(paths, samples, settings).reshape(n_bursts, n_columns).sum(axis=0)
-    header_llr = np.zeros((n_bursts, n_columns))
+    evidence, header_llr = evidence.reshape(n_bursts, n_columns).sum(axis=0), np.zeros((n_bursts, n_columns))
     return BurstPosteriors(w, w_log_prob, evidence, lit, index, log_prob, bit_llr, header_llr)
+
+
+def _part(samples: BurstSamples, lanes: IntArray, n_slots: int) -> BurstSamples:
+    """The first slots of some lanes, as those of one burst."""
+    if lanes.size == len(samples.log_scale) and n_slots == samples.light.shape[0]:
+        return samples
+    values = (samples.light, samples.noise, samples.valid, samples.neighbours)
+    light, noise, valid, neighbours = (each[:n_slots, :, lanes] for each in values)
+    of_lanes: dict[str, Any] = {"light": light, "noise": noise, "valid": valid, "neighbours": neighbours, "n_bursts": 1}
+    prior = None if samples.w_log_prior is None else samples.w_log_prior[lanes]
+    return replace(samples, **of_lanes, log_scale=samples.log_scale[lanes], w_log_prior=prior)
 
 
 def lane_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> FloatArray:
@@ -165,9 +190,9 @@ def _forward(
     for n in range(n_slots + reach):
         symbol, place = divmod(n, SLOTS_PER_SYMBOL) if n < n_slots else (0, n - n_slots)
         is_dimming = symbol == 1 and n < n_slots
-        books = np.full_like(paths.w, _HEADER) if symbol == 0 else np.full_like(paths.w, _DIMMING)
-        books = books if symbol < 2 else paths.w
-        origin, branches, gain = _branches(paths, np.full_like(books, _ARBITRARY) if is_free else books, place)
+        book = _ARBITRARY if is_free else (_HEADER, _DIMMING)[symbol] if symbol < 2 else None
+        books = paths.w if book is None else 0 * paths.w + book
+        origin, branches, gain = _branches(paths, books, place)
         if is_dimming and place == SLOTS_PER_SYMBOL - 1 and not is_free:
             branches.w = _n_lit()[branches.slots & _WORD]
             if samples.w_log_prior is not None:
@@ -175,9 +200,13 @@ def _forward(
         if n >= reach:
             gain = gain + settings.information * _update(branches, samples, n - reach, levels, settings)
         branches.log_likelihood = branches.log_likelihood + gain
-        n_recent = max(reach, place + 1) if n < n_slots and not is_free else reach
+        is_within = n < n_slots and not is_free
+        # Paths that differ in their word so far differ still with a slot more.
+        n_recent = None if is_within and place >= reach else max(reach, place + 1) if is_within else reach
         target, remaining = _merged(branches, n_recent, settings)
-        starts = np.flatnonzero(np.diff(origin, prepend=-1))
+        is_start = np.ones(origin.size, bool)
+        np.not_equal(origin[1:], origin[:-1], out=is_start[1:])
+        starts = np.flatnonzero(is_start)
         steps.append(_Step(origin[starts], starts, paths.w.shape[1], target, gain))
         paths = remaining
         if PREAMBLE_SLOTS <= n < n_slots and place == SLOTS_PER_SYMBOL - 1:
@@ -224,13 +253,18 @@ def _update(
     total = np.zeros(window.shape, np.float32)
     for place in range(q):
         valid = samples.valid[slot, place][:, None]
-        if not valid.any():
+        least, most = valid.min(), valid.max()
+        if not most:
             continue
         noise = samples.noise[slot, place][:, None]
-        light: Float32Array = samples.own * levels[place][window][..., None]
+        light: Float32Array = samples.own * levels[place].take(window)[..., None]
         light += samples.neighbours[slot, place][:, None]
-        variance = np.asarray(variance + drift * np.square(picture), np.float32)
-        error = samples.light[slot, place][:, None] - light * picture
+        power = np.square(picture)
+        largest = settings.max_variance * power
+        power *= drift
+        variance = np.add(variance, power, out=power)
+        error = light * picture
+        np.subtract(samples.light[slot, place][:, None], error, out=error)
         power = np.square(light)
         error_variance = power * variance
         error_variance += noise
@@ -240,62 +274,62 @@ def _update(
         wide = squared / nu
         wide += 1
         density = np.square(wide)
-        density *= np.sqrt(wide)
+        density *= np.sqrt(wide, out=wide)
         density *= error_variance
         np.log(density, out=density)
-        density *= valid
+        if not least:
+            density *= valid
         total -= density.sum(axis=-1)
         # An outlier is a jump of the picture.
         squared += nu
         squared /= nu + 1
-        np.clip(squared, 1, settings.max_jump, out=squared)
-        variance = np.minimum(variance * squared, settings.max_variance * np.square(picture))
+        np.maximum(squared, 1, out=squared)
+        np.minimum(squared, settings.max_jump, out=squared)
+        squared *= variance
+        variance = np.minimum(squared, largest, out=squared)
         power *= variance
         power += noise
         gain = light * variance
         gain /= power
-        gain *= valid
-        picture = picture + gain * error
-        np.clip(picture, settings.min_picture, settings.max_picture, out=picture)
+        if not least:
+            gain *= valid
+        error *= gain
+        error += picture
+        np.maximum(error, settings.min_picture, out=error)
+        picture = np.minimum(error, settings.max_picture, out=error)
         gain *= light
-        variance = np.maximum(variance * (1 - gain), np.float32(settings.min_variance))
+        np.subtract(1, gain, out=gain)
+        gain *= variance
+        variance = np.maximum(gain, np.float32(settings.min_variance), out=gain)
     branches.picture, branches.variance = picture, variance
     return np.asarray(total / (2 * q), np.float64)
 
 
-def _merged(branches: _Paths, n_recent: int, settings: SurvivorSettings) -> tuple[IntArray, _Paths]:
-    """Merge branches that agree in weight and in the last `n_recent` slots, and keep the likeliest.
+def _merged(branches: _Paths, n_recent: int | None, settings: SurvivorSettings) -> tuple[IntArray, _Paths]:
+    """Merge branches that agree in weight and in the last `n_recent` slots, and keep the likeliest; None: all differ.
 
     Returns:
         (lanes, J) the path that a branch is part of, -1 if it was dropped; the paths.
     """
     likelihood = branches.log_likelihood
-    lanes, n_branches = likelihood.shape
+    lanes, n_groups = likelihood.shape
     lane = np.arange(lanes)[:, None]
-    key = (branches.w << 2 * SLOTS_PER_SYMBOL) | (branches.slots & ((1 << n_recent) - 1))
-    order = np.lexsort((-likelihood, key))
-    place = order + n_branches * lane
-    ordered = key.take(place)
-    is_first = np.ones((lanes, n_branches), bool)
-    is_first[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
-    number = is_first.cumsum(axis=1) - 1
-    n_groups = int(number[:, -1].max()) + 1
-    number += n_groups * lane
-    group = np.empty_like(number)
-    group.put(place, number)
-    best = np.zeros(lanes * n_groups, np.int64)
-    best[number[is_first]] = order[is_first]
     top = likelihood.max(axis=1, keepdims=True)
-    relative = np.exp(np.maximum(likelihood - top, -700))
-    share = np.bincount(group.ravel(), relative.ravel(), lanes * n_groups).reshape(lanes, n_groups)
+    share = np.exp(np.maximum(likelihood - top, -700))
+    best = group = np.arange(lanes * n_groups).reshape(lanes, n_groups)
+    if n_recent is not None:
+        best, group, n_groups = _groups(branches, n_recent)
+        share = np.bincount(group.ravel(), share.ravel(), lanes * n_groups).reshape(lanes, n_groups)
     n_chosen = min(settings.max_paths, int((share > np.exp(-settings.max_lag)).sum(axis=1).max()), n_groups)
-    chosen = np.broadcast_to(np.arange(n_groups), (lanes, n_groups))
+    chosen: IntArray = np.arange(n_groups) + 0 * lane
     if n_chosen < n_groups:
         chosen = np.argpartition(-share, n_chosen - 1, axis=1)[:, :n_chosen]
+    elif n_recent is None:
+        return chosen, branches
     chosen = chosen + n_groups * lane
     place_of = np.full(lanes * n_groups, -1)
     place_of[chosen] = np.arange(n_chosen)
-    paths = branches.taken(best[chosen])
+    paths = branches.taken(best.take(chosen) - likelihood.shape[1] * lane)
     # The remaining paths stand for the dropped ones: where nothing is visible, all are equally likely.
     chosen_share = share.take(chosen)
     paths.log_likelihood = np.log(np.maximum(chosen_share, TINY**10)) + top
@@ -303,19 +337,34 @@ def _merged(branches: _Paths, n_recent: int, settings: SurvivorSettings) -> tupl
     return place_of[group], paths
 
 
-def _backward(
-    steps: list[_Step], ends: list[tuple[int, _Paths]], after: FloatArray
-) -> list[tuple[FloatArray, IntArray, IntArray]]:
+def _groups(branches: _Paths, n_recent: int) -> tuple[IntArray, IntArray, int]:
+    """Groups of branches that agree: (lanes, groups) number of the likeliest branch; (lanes, J) that of its group."""
+    likelihood = branches.log_likelihood
+    lanes, n_branches = likelihood.shape
+    lane = np.arange(lanes)[:, None]
+    key = (branches.w << 2 * SLOTS_PER_SYMBOL) | (branches.slots & ((1 << n_recent) - 1))
+    place = np.lexsort((-likelihood, key)) + n_branches * lane
+    ordered = key.take(place)
+    is_first = np.ones((lanes, n_branches), bool)
+    np.not_equal(ordered[:, 1:], ordered[:, :-1], out=is_first[:, 1:])
+    number = is_first.cumsum(axis=1) - 1
+    n_groups = int(number[:, -1].max()) + 1
+    number += n_groups * lane
+    group = np.empty_like(number)
+    group.put(place, number)
+    best = np.repeat(n_branches * lane, n_groups, axis=1)
+    best.put(number[is_first], place[is_first])
+    return best, group, n_groups
+
+
+def _backward(steps: list[_Step], ends: list[tuple[int, _Paths]], after: FloatArray) -> _Words:
     """Posterior, weight and word of the paths at the end of every symbol, (lanes, paths) each."""
-    out: list[tuple[FloatArray, IntArray, IntArray]] = []
+    out: _Words = []
     pending = list(ends)
     for n in range(len(steps) - 1, PREAMBLE_SLOTS - 1, -1):
         if pending and pending[-1][0] == n:
             paths = pending.pop()[1]
-            posterior = paths.log_likelihood + after
-            posterior = np.exp(posterior - posterior.max(axis=1, keepdims=True))
-            posterior /= posterior.sum(axis=1, keepdims=True)
-            out.append((posterior, paths.w, paths.slots & _WORD))
+            out.append(_posterior(paths, after))
         step = steps[n]
         gain = step.gain + np.take_along_axis(after, np.maximum(step.target, 0), 1)
         gain[step.target < 0] = _NEVER
@@ -327,27 +376,33 @@ def _backward(
     return out[::-1]
 
 
+def _posterior(paths: _Paths, after: FloatArray | float = 0.0) -> tuple[FloatArray, IntArray, IntArray]:
+    """Posterior, weight and word of paths, given the log-likelihood of what comes after."""
+    posterior = paths.log_likelihood + after
+    posterior = np.exp(posterior - posterior.max(axis=1, keepdims=True))
+    return posterior / posterior.sum(axis=1, keepdims=True), paths.w, paths.slots & _WORD
+
+
 def _weight_log_prob(posterior: FloatArray, w: IntArray, _: IntArray) -> FloatArray:
     """(lanes, 9) log probability of each weight."""
     by_weight = np.stack([(posterior * (w == weight)).sum(axis=1) for weight in WEIGHTS], axis=1)
     return np.asarray(np.log(np.maximum(by_weight, TINY)))
 
 
-def _word_posteriors(
-    words: list[tuple[FloatArray, IntArray, IntArray]], weight: int, shape: tuple[int, int]
-) -> FloatArray:
+def _word_posteriors(followed: list[tuple[IntArray, _Words]], weight: int, shape: tuple[int, int, int]) -> FloatArray:
     """(B, C, N, words) posterior of the words of a weight, uniform where no path of that weight is left."""
     place_of = np.full(_WORD + 1, -1)
     place_of[codebook(weight) @ (1 << np.arange(SLOTS_PER_SYMBOL - 1, -1, -1))] = np.arange(len(codebook(weight)))
-    out = np.empty((shape[0] * shape[1], len(words), len(codebook(weight))))
-    lane = np.arange(len(out))[:, None]
-    for number, (posterior, w, word) in enumerate(words):
-        # A little for every word, since paths that were dropped are not impossible.
-        of_words = np.full((len(out), out.shape[-1]), TINY)
-        place = place_of[word]
-        np.add.at(of_words, (lane, np.maximum(place, 0)), np.where((w == weight) & (place >= 0), posterior, 0.0))
-        out[:, number] = of_words / of_words.sum(axis=1, keepdims=True)
-    return out.reshape(*shape, *out.shape[1:])
+    out = np.full((shape[0] * shape[1], shape[2], len(codebook(weight))), 1 / len(codebook(weight)))
+    for lanes, words in followed:
+        lane = np.arange(lanes.size)[:, None]
+        for number, (posterior, w, word) in enumerate(words):
+            # A little for every word, since paths that were dropped are not impossible.
+            of_words = np.full((lanes.size, out.shape[-1]), TINY)
+            place = place_of[word]
+            np.add.at(of_words, (lane, np.maximum(place, 0)), np.where((w == weight) & (place >= 0), posterior, 0.0))
+            out[lanes, number] = of_words / of_words.sum(axis=1, keepdims=True)
+    return out.reshape(*shape, -1)
 
 
 @cache

@@ -126,6 +126,20 @@ def test_a_symbol_that_nothing_shows_is_open() -> None:
     assert found.log_prob[0, :, 2:].max() < np.log(0.2)
 
 
+def test_a_burst_that_shows_its_header_alone_costs_the_other_nothing() -> None:
+    rng = np.random.default_rng(12)
+    weights = [3, 5, 8]
+    index = [rng.integers(0, 1 << bits_per_symbol(w), 30) for w in weights]
+    burst = samples([packet(i, w) for i, w in zip(index, weights, strict=True)], 1.1, rng, 0.01, 0.02)
+    both = side_by_side([burst, burst])
+    both.valid[12:, :, 3:] = 0
+    found, alone = detect(both), detect(burst)
+    assert np.array_equal(found.w, alone.w)
+    assert np.allclose(np.exp(found.w_log_prob), np.exp(alone.w_log_prob), atol=0.01)
+    assert np.allclose(found.log_prob[0], alone.log_prob[0])
+    assert np.allclose(found.log_prob[1], [[-np.log(1 << bits_per_symbol(w))] for w in weights])
+
+
 def test_a_column_that_leaves_its_weight_open_has_that_of_all() -> None:
     rng = np.random.default_rng(11)
     weights = [7, 7, 7, 7, 7, 3]
