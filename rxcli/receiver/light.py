@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import MIN_FLOAT32, NORMAL_MEDIAN, TINY
+from rxcli.numerics import MIN_FLOAT32, NORMAL_MEDIAN, TINY, local_mean
 from rxcli.protocol import HEADER, slot_patterns
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -37,8 +37,40 @@ _DARK_TO = HEADER.index(1, _DARK_FROM)
 MIN_VARIANCE = 1e-7
 #: Largest light above black, relative to white, of a sample that counts as dark, and minimum number of those.
 _DARK_LIGHT, _MIN_DARK_SAMPLES = 0.001, 50
+#: Slots of the local level that changes of the light are relative to; limit of a change, in root mean squares.
+_LEVEL_SLOTS, _MAX_CHANGE = 8, 1.5
 #: Shortest exposure, slots, and narrowest spread of light, column pitches.
 _MIN_WIDTH = 1e-3
+
+
+def changes_over(
+    light: Float32Array, inside: Float32Array, rows: float, sigma: float
+) -> tuple[Float32Array, Float32Array]:
+    """Changes of light over one slot, which are as sharp through a long exposure as the light of a short one.
+
+    An exposure of L slots that ends one slot later has gained one slot and lost the one L slots before.
+
+    Args:
+        light: (M, R) of strips.
+        inside: (M, R) 1 where it is on the screen, else 0.
+        rows: of a slot.
+        sigma: standard deviation of dark light.
+
+    Returns:
+        (M, R) changes against the local level, bounded; and 1 where they are on the screen.
+    """
+    smooth, size = local_mean(light, max(round(rows / 2), 1)), round(_LEVEL_SLOTS * rows)
+    level = local_mean(light, size) / np.maximum(local_mean(inside, size), np.float32(TINY))
+    n, before = light.shape[1], int(rows)
+    share, change, valid = np.float32(rows - before), np.zeros_like(smooth), inside.copy()
+    earlier = (1 - share) * smooth[:, 1 : n - before] + share * smooth[:, : n - before - 1]
+    change[:, before + 1 :] = smooth[:, before + 1 :] - earlier
+    valid[:, before + 1 :] *= inside[:, : n - before - 1]
+    valid[:, : before + 1] = 0
+    change *= valid / (np.maximum(level, 0) + np.float32(sigma + TINY))
+    count = np.maximum(valid.sum(axis=1, keepdims=True), 1)
+    change /= np.sqrt(np.square(change).sum(axis=1, keepdims=True) / count) + np.float32(TINY)
+    return np.clip(change, -_MAX_CHANGE, _MAX_CHANGE), valid
 
 
 @dataclass(frozen=True, slots=True)

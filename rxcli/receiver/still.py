@@ -30,6 +30,7 @@ from rxcli.receiver.light import (
     slot_llr,
 )
 from rxcli.receiver.sync import clock as sync
+from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.types import (
     BurstPosteriors,
     BurstSamples,
@@ -351,7 +352,7 @@ def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[
         return
     (_, log_weight), *rivals = sync.possible_bursts(reception.clock, slot_llr(reception.metrics), acquisition.repeats)
     for clock, rival_log_weight in rivals:
-        if log_weight - rival_log_weight <= SETTINGS.plain_bursts or not reception.is_complete.any():
+        if log_weight - rival_log_weight <= sync_settings.settled_llr or not reception.is_complete.any():
             rival = replace(reception, clock=clock, posteriors=detected(reception.metrics, clock))
             yield rival, log_weight - rival_log_weight
 

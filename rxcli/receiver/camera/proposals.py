@@ -18,7 +18,7 @@ from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.curvature import UNIT_BEND, likeliest_bend, straightened
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import ColumnStrips, columns_of, joined, levelled
-from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MAX_EXPOSURE_SLOTS
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MAX_EXPOSURE_SLOTS, changes_over
 from rxcli.types import Float32Array, FloatArray
 
 #: Samples a slot at which headers are sought; bins of the spectrum to a line's width.
@@ -296,11 +296,13 @@ def _long_exposures(strips: ColumnStrips, *, is_stated: bool) -> Iterator[tuple[
     None if the strongest line is of a short exposure.
     """
     lines = slot_lines(strips)
-    lines = [line for line in lines if line[1] >= max(SETTINGS.min_line_share * lines[0][1], SETTINGS.min_line)]
+    # Lines of noise have a strength of 2 on average.
+    least = 2 + SETTINGS.min_slot_line
+    lines = [line for line in lines if line[1] >= max(SETTINGS.min_line_share * lines[0][1], least)]
     # Of light that is exposed for half a slot more than whole ones the line is at twice the rate.
     lines += [(2 * rows, strength) for rows, strength in lines if not _is_among(2 * rows, lines)]
     for number, (rows, strength) in enumerate(lines):
-        change = changes_over(strips, rows)
+        change, _ = changes_over(strips.light, strips.inside, rows, strips.noise.sigma)
         exposure = exposure_by_changes(columns_of(change, strips.n_columns), rows)
         if exposure > LONG_EXPOSURE_SLOTS or is_stated:
             yield rows, strength, exposure, change
@@ -362,7 +364,7 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
         nearest, furthest = (int(slots * lag) for slots in SETTINGS.exposure_lags)
         if light.shape[1] < 2 * furthest:
             continue
-        smooth = _blurred(light, max(lag // 2, 1))
+        smooth = local_mean(light, max(lag // 2, 1))
         turn = smooth[:, 2 * lag :] - 2 * smooth[:, lag:-lag] + smooth[:, : -2 * lag]
         turn /= np.median(np.abs(turn), axis=1, keepdims=True) + np.float32(TINY)
         most = np.float32(SETTINGS.max_bend_ratio)
@@ -393,42 +395,17 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
 
 def _line_spectrum(values: Float32Array, lag: int, size: int) -> FloatArray:
     """Power of values (C, n) over what is usual at such frequencies; places are cycles in `size` values."""
-    values = values - _blurred(values, 20 * SLOTS_PER_SYMBOL * lag // 2)
+    values = values - local_mean(values, 20 * SLOTS_PER_SYMBOL * lag // 2)
     n = values.shape[1]
     power = np.square(np.abs(np.fft.rfft(values * np.hanning(n).astype(np.float32), size, axis=1)))
     spectrum = (power / (power.mean(axis=1, keepdims=True) + TINY)).sum(axis=0)
-    return np.asarray(spectrum / (_blurred(spectrum[None].astype(np.float32), SETTINGS.line_bins)[0] + TINY))
+    return np.asarray(spectrum / (local_mean(spectrum[None].astype(np.float32), SETTINGS.line_bins)[0] + TINY))
 
 
 def _own_light(columns: Float32Array) -> Float32Array:
     """What columns (C, R) do not have in common, as headers, unless all of them send the same."""
     own = columns - columns.mean(axis=0)
     return own if np.square(own).mean() > np.square(columns).mean() / 2 else columns
-
-
-def changes_over(strips: ColumnStrips, rows: float) -> Float32Array:
-    """(M, R) change of the light over some rows against its local level, bounded; 0 where not on the screen."""
-    smooth = _blurred(strips.light, max(round(rows / 2), 1))
-    size = round(SETTINGS.level_slots * rows)
-    level = _blurred(strips.light, size) / np.maximum(_blurred(strips.inside, size), np.float32(TINY))
-    n, before = strips.light.shape[1], int(rows)
-    share, change = np.float32(rows - before), np.zeros_like(smooth)
-    earlier = (1 - share) * smooth[:, 1 : n - before] + share * smooth[:, : n - before - 1]
-    change[:, before + 1 :] = smooth[:, before + 1 :] - earlier
-    valid = strips.inside.copy()
-    valid[:, before + 1 :] *= strips.inside[:, : n - before - 1]
-    valid[:, : before + 1] = 0
-    change *= valid / (level + np.float32(strips.noise.sigma) + np.float32(TINY))
-    change /= np.sqrt(
-        np.square(change).sum(axis=1, keepdims=True) / np.maximum(valid.sum(axis=1, keepdims=True), 1)
-    ) + np.float32(TINY)
-    return np.clip(change, -SETTINGS.max_change, SETTINGS.max_change)
-
-
-def _blurred(values: Float32Array, n: int) -> Float32Array:
-    import cv2
-
-    return np.asarray(cv2.blur(np.ascontiguousarray(values), (min(n, 2 * values.shape[1] - 1) | 1, 1)))
 
 
 def _autocorrelation(columns: Float32Array, later: Float32Array | None = None) -> FloatArray:

@@ -53,16 +53,11 @@ class EstimateSettings:
     exposure_step: float = 0.1
     #: Least strength of a line that is looked at, as a share of the strongest.
     min_line_share: float = 0.5
-    #: Strength that a line of noise reaches in one of ten pictures: 2 on average, and ln(10 * 2000 bins).
-    min_line: float = 11.9
     #: Exposures that are looked for, in the lags of bends.
     exposure_lags: tuple[float, float] = (3.7, 66.0)
-    #: Rows over which bends of the light are taken; limits of a bend, in medians, and of a change, in rms; slots of
-    #: the local level.
+    #: Rows over which bends of the light are taken; limit of a bend, in medians.
     bend_lags: tuple[int, ...] = (1, 2, 4, 8)
     max_bend_ratio: float = 4.0
-    max_change: float = 1.5
-    level_slots: float = 8.0
     #: Black level, as a share of a percentile of the light; least light above it.
     dark_share: float = 0.8
     dark_percent: float = 0.5

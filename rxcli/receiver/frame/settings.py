@@ -13,8 +13,6 @@ class PassSettings:
 
     #: Log-likelihood below the best weight at which a weight is dropped.
     weight_margin: float = 20.0
-    #: Lead of an assignment of copies to bursts, log-likelihood of their similarity, that is beyond doubt.
-    plain_bursts: float = 24.0
     #: Log-likelihood ratio from which a column has packets even without a header: of 16 packets more than at 100 in 350
     #: stills all were right. Wrong clocks, which show none in any column, reach 74.
     min_headerless_llr: float = 60.0

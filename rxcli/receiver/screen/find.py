@@ -60,11 +60,11 @@ _UNLIT_COLUMNS = 0.5
 class ColumnLayout:
     """Columns of a screen: number, light spread and aspect."""
 
-    n_columns: int = 20
+    n_columns: int
     #: Light spread, column pitches.
-    sigma: float = 0.45
+    sigma: float
     #: Width over height of the screen.
-    aspect: float = 16 / 9
+    aspect: float
 
     @property
     def is_narrow(self) -> bool:

@@ -18,13 +18,13 @@ from rxcli.receiver.decode.settings import SETTINGS as DECODE
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception
-from rxcli.receiver.frame.settings import SETTINGS as PASSES
 from rxcli.receiver.light import slot_llr
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.cameras import settle
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import detected
 from rxcli.receiver.sync import clock as sync
+from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.types import Clock, FloatArray
 
 #: Limit of log-odds, so that no single picture settles a question for ever.
@@ -83,7 +83,7 @@ def framing_of(
     likeliest, *rivals = framings[own.packet_slots]
     # A packet starts anywhere in its length.
     prior = 1 / sum(own.packet_slots / length for length in {own.packet_slots, *(s.packet_slots for s in screens)})
-    is_plain = all(likeliest[1] - rival[1] > PASSES.plain_bursts for rival in rivals)
+    is_plain = all(likeliest[1] - rival[1] > sync_settings.settled_llr for rival in rivals)
     if len(lengths) == 1 and is_plain and np.array_equal(likeliest[0].burst, own.burst):
         return Framing(prior, 1.0, np.ones(int(own.burst.max()) + 1))
     log_weight = np.array([_log_weight(reception, *framing) for each in framings.values() for framing in each])

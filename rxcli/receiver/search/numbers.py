@@ -18,8 +18,6 @@ from rxcli.receiver.still import initial_pass
 
 #: Columns that are read beside the outermost, because they shed light there.
 _BESIDE = 2
-#: Distance from a screen's sides within which those of another outline are the same, screen widths.
-_SAME_COLUMNS = 0.025
 
 
 def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Proposer) -> list[Outline]:
@@ -83,7 +81,7 @@ def _has_columns_of(own: Outline, rival: Outline) -> bool:
     """Whether a rival's columns are where one's own are, on whatever rows."""
     points = np.pad(rival.corners, ((0, 0), (0, 1)), constant_values=1.0) @ np.linalg.inv(homography(own.corners)).T
     off = points[:, 0] / points[:, 2] - [0, 1, 1, 0]
-    return rival.n_columns in (None, own.n_columns) and bool(np.abs(off).max() < _SAME_COLUMNS)
+    return rival.n_columns in (None, own.n_columns) and bool(np.abs(off).max() < SETTINGS.same_sides)
 
 
 def _columns_between(own: Outline, rival: Outline, n_columns: int) -> int:

@@ -26,8 +26,8 @@ _TOO_SLOW = (
     "the screen may have no profile here (vlc-rx profiles lists them); else use a faster slot rate or shorter packets"
 )
 #: Log-odds of the bright part of a picture against columns that were found; probability that it, or the part with
-#: stripes, is the whole screen, if it shows packets; and the share of its width within which corners are the same.
-_BRIGHT_LOG_ODDS, _BRIGHT_CERTAINTY, _SAME_OUTLINE = -50.0, 0.9, 0.025
+#: stripes, is the whole screen, if it shows packets.
+_BRIGHT_LOG_ODDS, _BRIGHT_CERTAINTY = -50.0, 0.9
 #: Natural logarithm of the ratio of aspects up to which a bright part may be the screen, and its probability beyond: of
 #: 39 bright parts of dark pictures none had the screen's aspect, and films alone, one in three, its width.
 _SAME_ASPECT, _FILM_CERTAINTY = 0.08, 0.3
@@ -123,7 +123,7 @@ def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
         # The picture on the screen may show borders that are none of the columns'.
         certainty = _BRIGHT_CERTAINTY if _may_be_screen(bright, layouts) else _FILM_CERTAINTY
         own = viewed(Outline(bright, certainty, log_odds=_BRIGHT_LOG_ODDS, family=-1))
-        tolerance = _SAME_OUTLINE * np.ptp(bright[:, 0])
+        tolerance = SETTINGS.same_sides * np.ptp(bright[:, 0])
         if all(np.abs(outline.corners - own.corners).max() >= tolerance for outline in outlines[0]):
             outlines[0].append(own)
     return outlines

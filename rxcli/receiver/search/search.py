@@ -14,6 +14,7 @@ from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.frame.settings import SETTINGS as PASSES
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.screen.find import ColumnLayout
 from rxcli.receiver.screen.outline import Outline
@@ -97,7 +98,9 @@ def _search(
         budget = SETTINGS.borderless_budget if outlines[0].family < 0 else SETTINGS.doubtful_budget
     walk = _Walk(proposer, budget)
     best = walk.run()
-    min_evidence = SETTINGS.bail if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
+    min_evidence = (
+        PASSES.min_packets_llr if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
+    )
     if best is None or best.evidence < min_evidence:
         best = walk.best_without_packets()
     if best is None:
@@ -203,7 +206,7 @@ class _Walk:
 
     def _is_hopeless(self) -> bool:
         passes = [step.evidence for step in self._tried if step.fate != "no clock"]
-        return len(passes) >= SETTINGS.hopeless_budget and max(passes) < SETTINGS.bail
+        return len(passes) >= SETTINGS.hopeless_budget and max(passes) < PASSES.min_packets_llr
 
     def _push(self, queue: list[_Entry], key: float, hypothesis: Hypothesis) -> None:
         heapq.heappush(queue, (-key, hypothesis.identity, next(self._number), hypothesis))
@@ -247,25 +250,25 @@ class _Walk:
             return
         if (best is not None or is_costly) and hypothesis.screen.columns > SETTINGS.few_columns:
             half = self._measured(hypothesis, acquisition.of_columns(acquisition.middle_columns))
-            min_score, min_evidence, lead = -np.inf, SETTINGS.bail, 0.0
+            min_score, min_evidence, lead = -np.inf, PASSES.min_packets_llr, 0.0
             if best is not None:
-                lead = evidence.middle_score(best) - best.score if best.evidence > SETTINGS.bail else 0.0
+                lead = evidence.middle_score(best) - best.score if best.evidence > PASSES.min_packets_llr else 0.0
                 is_plain = best.evidence > SETTINGS.plain
                 min_score = best.score + (lead if is_plain else -SETTINGS.reach)
-                min_evidence = min(SETTINGS.bail, best.evidence)
+                min_evidence = min(PASSES.min_packets_llr, best.evidence)
             if half.score < min_score or half.evidence < min_evidence:
                 # By the middle columns alone scores are others than by all: the best one shows by how much.
                 self._tried.append(Tried(hypothesis, half.evidence, half.score - lead, "half"))
-                self._n_in_vain += is_costly and half.evidence < SETTINGS.bail
+                self._n_in_vain += is_costly and half.evidence < PASSES.min_packets_llr
                 return
         scored = self._measured(hypothesis, acquisition)
-        if scored.evidence > SETTINGS.bail:
+        if scored.evidence > PASSES.min_packets_llr:
             # Packets may become certain once an estimated camera is fitted: then no other camera is tried.
             scored = self._fitted(scored)
         scored = _in_likeliest_bursts(scored)
         self._scored.append(scored)
         self._tried.append(Tried(hypothesis, scored.evidence, scored.score, "lost"))
-        if scored.evidence > SETTINGS.bail and (best is None or scored.score > best.score - SETTINGS.reach):
+        if scored.evidence > PASSES.min_packets_llr and (best is None or scored.score > best.score - SETTINGS.reach):
             for sibling in self._proposer.siblings(scored):
                 self._push(self._siblings, scored.score + sibling.log_prior - hypothesis.log_prior, sibling)
 
@@ -288,7 +291,7 @@ def _rated(hypothesis: Hypothesis, context: FrameContext, acquisition: Acquisiti
 
 def _in_likeliest_bursts(scored: Scored) -> Scored:
     """The same with its copies assigned to bursts as its packets fit best, if they are uncertain."""
-    if scored.evidence < SETTINGS.bail:
+    if scored.evidence < PASSES.min_packets_llr:
         return scored
     hypothesis, context, acquisition = scored.hypothesis, scored.context, scored.acquisition
     ways = [(scored, 0.0)]

@@ -15,8 +15,6 @@ class SearchSettings:
     complete_packet: float = 60.0
     #: Above this evidence nothing further is proposed under a known camera: wrong clocks reach 391.
     plain: float = 400.0
-    #: Below this evidence there are no packets: wrong clocks mostly have less than 10, right ones 80.
-    bail: float = 20.0
     #: Below this evidence an estimated camera is rejected; above the second no other one is proposed.
     few_packets: float = 40.0
     plain_estimate: float = 100.0
@@ -47,6 +45,8 @@ class SearchSettings:
     #: Weight of the log-likelihood of packets in outermost columns, as samples err together.
     outer_weight: float = 0.2
 
+    #: Distance, screen widths, within which the sides of two outlines are the same.
+    same_sides: float = 0.025
     #: Minimum overlap of a given outline and the picture, as a fraction of either.
     min_overlap: float = 0.002
     #: Minimum number of rows for blind camera estimation.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import TINY, folded, header_correlation, peak_offset
 from rxcli.protocol import EXTREMES_SLOTS, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
-from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MAX_EXPOSURE_SLOTS, dark_sigma
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MAX_EXPOSURE_SLOTS, changes_over, dark_sigma
 from rxcli.receiver.sync.settings import SETTINGS
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray, RowProfiles, SlotSamples
 
@@ -154,28 +154,11 @@ def search_contrast(light: Float32Array, valid: Float32Array, min_sigma: float) 
 
 
 def slot_differences(light: Float32Array, valid: Float32Array, min_sigma: float) -> tuple[Float32Array, Float32Array]:
-    """As `search_contrast`, for long exposures: changes of light over one slot, which are as sharp as a short exposure.
-
-    An exposure of L slots that ends one slot later has gained one slot and lost the one L slots before.
-    """
-    import cv2
-
-    q = SETTINGS.search_samples
-    flat = light.reshape(-1, light.shape[-1])
-    size = (SETTINGS.difference_slots * q | 1, 1)
-    level = cv2.blur(flat, size) / np.maximum(cv2.blur(valid.reshape(flat.shape), size), np.float32(1 / size[0]))
-    smooth = cv2.blur(flat, (q // 2 | 1, 1))
-    change = np.zeros_like(smooth)
-    change[:, q:] = smooth[:, q:] - smooth[:, :-q]
-    change /= np.maximum(level, 0) + np.float32(min_sigma)
-    change = change.reshape(light.shape)
-    is_valid = valid.copy()
-    is_valid[..., q:] *= valid[..., :-q]
-    is_valid[..., :q] = 0
-    count = np.maximum(is_valid.sum(axis=-1, keepdims=True), 1)
-    change /= np.sqrt((change * change * is_valid).sum(axis=-1, keepdims=True) / count) + np.float32(TINY)
-    bound = np.float32(SETTINGS.max_difference)
-    return (np.clip(change, -bound, bound) * is_valid).mean(axis=1) / bound, is_valid.sum(axis=1)
+    """As `search_contrast`, for long exposures: changes of light over one slot."""
+    flat, inside = (values.reshape(-1, light.shape[-1]) for values in (light, valid))
+    changes = changes_over(flat, inside, SETTINGS.search_samples, min_sigma)
+    change, is_valid = (part.reshape(light.shape) for part in changes)
+    return change.mean(axis=1), is_valid.sum(axis=1)
 
 
 def _without_echo(response: FloatArray, samples: float) -> FloatArray:

@@ -11,9 +11,6 @@ class SyncSettings:
     search_samples: int = 4
     #: Contrast, in standard deviations of a sample, at which a strip has half its full weight.
     contrast_sigmas: float = 8.0
-    #: Slots of the level that changes are relative to; limit of a change, in root mean squares.
-    difference_slots: int = 8
-    max_difference: float = 1.5
     #: Largest valid light, in units of white.
     max_light: float = 1e3
 
@@ -37,7 +34,7 @@ class SyncSettings:
     min_slot_light: float = 0.3
     #: Share of the slots that are misread in all columns of a copy.
     misread_slots: float = 0.1
-    #: Log-likelihood ratio at which the phase of the bursts is settled.
+    #: Lead, log-likelihood ratio, at which the assignment of copies to bursts is settled.
     settled_llr: float = 24.0
 
     #: Largest deviation, slots, of a clock from the prediction of earlier frames; beyond it the link time is lost.

@@ -37,7 +37,8 @@ from rxcli.receiver.screen.strips import PictureStrips, read_strips, shows_narro
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
 from rxcli.types import Clock, FloatArray, Frame, Lens, LightPlane, Mosaic
 
-WIDE, NARROW = ColumnLayout(), ColumnLayout(100, 0.5)
+ASPECT = 16 / 9
+WIDE, NARROW = ColumnLayout(20, 0.45, ASPECT), ColumnLayout(100, 0.5, ASPECT)
 HEIGHT, WIDTH = 1600, 1200
 NARROW_HEIGHT, NARROW_WIDTH = 1120, 1680
 #: Tilted by 4 and 3 degrees, turned by 1, before a lens of 0.8 picture widths.
@@ -236,7 +237,7 @@ def test_decided_slots_move_the_columns_to_their_place(is_turned: bool) -> None:
     if is_turned:  # Corners and columns are a viewer's, who sees the stored picture upside down.
         before, lit = before[[2, 3, 0, 1]], lit[::-1]
     corners = corners_by_slots(
-        Outline(before, strips=strips), ColumnLayout(20, 0.47), clock, np.ascontiguousarray(lit), None
+        Outline(before, strips=strips), ColumnLayout(20, 0.47, ASPECT), clock, np.ascontiguousarray(lit), None
     )
     corners = corners[[2, 3, 0, 1]] if is_turned else corners
     off = (corners - CORNERS) @ along / (along @ along)
@@ -254,7 +255,7 @@ def test_a_screen_larger_than_the_picture_shows_no_side() -> None:
 
 
 def test_numbers_of_columns_compete() -> None:
-    candidates = find_outlines(drawn("white"), [ColumnLayout(10), WIDE, ColumnLayout(40)])
+    candidates = find_outlines(drawn("white"), [ColumnLayout(n, 0.45, ASPECT) for n in (10, 20, 40)])
     assert candidates[0].n_columns == WIDE.n_columns
     assert np.abs(apart(candidates[0])).max() < 0.2
 
