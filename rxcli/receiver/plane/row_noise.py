@@ -65,7 +65,9 @@ def find_row_noise(plane: LightPlane) -> RowNoise | None:
     some = cells(left[::2], slice(*middle))
     change = some[:, 1:-1] - (some[:, 2:] + some[:, :-2]) / 2
     change /= change.std(axis=1, keepdims=True) + np.float32(TINY)
-    if change.mean(axis=0).var() < ROW_NOISE.noisy:
+    common = change.mean(axis=0)
+    # Changes of noise are the opposite a row or two on, those of slots that all columns share last.
+    if common.var() < ROW_NOISE.noisy or common[:-2] @ (common[1:-1] + common[2:]) > 0:
         return None
     x, light = (left + width / 2) / n_cells - 0.5, cells(left, slice(None))
     curvature = _curvature(light, x)

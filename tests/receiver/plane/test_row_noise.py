@@ -1,12 +1,13 @@
 """Row noise: found where there is much, straight or bent by lens correction, and taken out of light and colours."""
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from rxcli.ingest.luma import colours_of, luma_of
 from rxcli.receiver.frame.cache import FrameCache
-from rxcli.receiver.plane import find_row_noise, read_plane, tone_to_light
+from rxcli.receiver.plane import find_row_noise, read_plane, row_noise, tone_to_light
 from rxcli.types import Colours, Frame, Metadata
 
 N_ROWS, N_PIXELS, ROWS_PER_SLOT = 1200, 960, 8
@@ -75,6 +76,12 @@ def test_noise_is_found_as_large_as_it_was_drawn() -> None:
 def test_slots_are_no_noise(same_slots: bool) -> None:
     """Nor are those that all columns share."""
     assert find_row_noise(read_plane(frame_of(picture(0.0, same_slots=same_slots)))) is None
+
+
+def test_slots_that_columns_share_are_told_without_a_search_for_bends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(row_noise, "_curvature", lambda *_: pytest.fail("rows were bent"))
+    exposed = cv2.blur(picture(0.0, same_slots=True), (1, ROWS_PER_SLOT))
+    assert find_row_noise(read_plane(frame_of(np.asarray(exposed, np.uint8)))) is None
 
 
 @pytest.mark.parametrize("red_blinks", [0.1, 1.0])
