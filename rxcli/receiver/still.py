@@ -14,7 +14,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel
 from rxcli.receiver.channel import denoise, ratios
-from rxcli.receiver.decode import detect, survivors
+from rxcli.receiver.decode import assemble, detect, survivors
 from rxcli.receiver.decode.settings import QUICK_SURVIVORS
 from rxcli.receiver.decode.settings import SURVIVORS as survivor_settings
 from rxcli.receiver.frame.acquisition import Acquisition, noise_of
@@ -193,7 +193,10 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
     snr = _joint_snr(model.over_black(samples), samples, model, clock)
     # Noise is no evidence, and leaves most symbols open.
-    share = (posteriors.log_prob > np.log(0.5)).mean(axis=(0, 2)) * ~dark_columns(snr)
+    observed = assemble.slots_observed(samples, clock)[..., PREAMBLE_SLOTS:] > 0
+    is_shown = observed.reshape(*posteriors.log_prob.shape, -1).all(axis=-1)
+    is_decided = (posteriors.log_prob > np.log(0.5)) & is_shown
+    share = is_decided.sum(axis=(0, 2)) / np.maximum(is_shown.sum(axis=(0, 2)), 1) * ~dark_columns(snr)
     llr = (posteriors.log_evidence - free) * share
     shape = posteriors.header_llr.shape
     posteriors = replace(posteriors, header_llr=np.broadcast_to(llr / shape[0], shape))
@@ -309,11 +312,14 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
     """
     every, some = np.arange(len(reception.snr)), _some(columns)
     lit = reception.clock.on_grid(reception.posteriors.lit)
+    w_log_prior = reception.posteriors.w_log_prob[some] + np.log(len(WEIGHTS))
 
     def evidence(clock: Clock, levels: list[float]) -> FloatArray:
         samples, model = _view(acquisition, reception, every, STILL.coarse_samples, ratios.by_start(clock))
         models = (replace(model, black_level=level) for level in levels)
         parts = [ratios.burst_samples(samples, clock, each, some, lit) for each in models]
+        # A column has one weight, whatever its bursts: they must not pay for it each.
+        parts = [replace(part, w_log_prior=np.tile(w_log_prior, (part.n_bursts, 1))) for part in parts]
         by_lane = survivors.lane_log_evidence(survivors.side_by_side(parts), QUICK_SURVIVORS)
         return np.asarray(by_lane.reshape(len(levels), -1, some.size).sum(axis=1))
 
@@ -324,10 +330,13 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
     levels = [float(np.percentile(light, STILL.dark_percent)) * share for share in STILL.dark_shares]
     level = levels[int(evidence(clock, levels).sum(axis=1).argmax())]
     ways = [way for way, _ in sync.possible_bursts(clock, slot_llr(reception.metrics), acquisition.repeats)]
-    gains = np.concatenate([evidence(way, [level]) for way in ways])
-    most = STILL.max_column_gain
-    best = ways[int(np.clip(gains - gains[0], -most, most).sum(axis=1).argmax())]
-    refined = replace(reception, clock=best, model=replace(reception.model, black_level=level))
+    by_column = np.concatenate([evidence(way, [level]) for way in ways])
+    gains = np.clip(by_column - by_column[0], -STILL.max_column_gain, STILL.max_column_gain).sum(axis=1)
+    best = ways[int(gains.argmax())]
+    by_evidence = [(way.burst, gain) for way, gain in zip(ways, gains.tolist(), strict=True)]
+    refined = replace(
+        reception, clock=best, model=replace(reception.model, black_level=level), bursts_by_evidence=by_evidence
+    )
     if np.array_equal(best.burst, reception.clock.burst):
         return refined
     posteriors = detected(reception.metrics, best)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_stages import clock_of, profiles_of
+from msgspec import structs
 
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import WEIGHTS, encode_packet
@@ -51,6 +52,27 @@ def test_a_known_picture_shows_the_slots_behind_it(exposure_slots: float) -> Non
     ]
     assert wrong[0] < 0.02
     assert wrong[1] > 0.1
+
+
+def test_a_header_alone_of_another_burst_leaves_the_evidence() -> None:
+    """Symbols that are not in view are no sign of noise."""
+    acquisition, _, _ = rough_frame(4.0, texture=0.02)
+    profiles, n_rows = replace(acquisition.profiles, level=None), round(24 * ROWS_PER_SLOT)
+    longer = {
+        name: np.pad(getattr(profiles, name), ((0, 0), (0, 0), (0, n_rows)), "wrap") for name in ("light", "inside")
+    }
+    longer["rows"] = np.arange(profiles.rows.size + n_rows)
+    clock = replace(acquisition.clock, n_slots=acquisition.clock.n_slots + 24, burst=np.arange(2))
+    once = (structs.replace(acquisition.screen, repeats=1),)
+    one, two = (
+        initial_pass(each)
+        for each in (
+            replace(acquisition, profiles=profiles),
+            replace(acquisition, profiles=replace(profiles, **longer), clock=clock, variants=once),
+        )
+    )
+    assert two.clock.burst.tolist() == [0, 1]
+    assert (two.posteriors.header_llr.sum(axis=0) > 0.9 * one.posteriors.header_llr.sum(axis=0)).all()
 
 
 def test_noise_of_rows_is_taken_off_by_the_slots_of_all_columns() -> None:

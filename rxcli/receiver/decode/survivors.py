@@ -196,7 +196,9 @@ def _forward(
         if is_dimming and place == SLOTS_PER_SYMBOL - 1 and not is_free:
             branches.w = _n_lit()[branches.slots & _WORD]
             if samples.w_log_prior is not None:
-                gain = gain + np.take_along_axis(samples.w_log_prior, branches.w - 1, 1)
+                gain = gain + np.take_along_axis(
+                    samples.w_log_prior, np.clip(branches.w, WEIGHTS[0], WEIGHTS[-1]) - 1, 1
+                )
         if n >= reach:
             gain = gain + settings.information * _update(branches, samples, n - reach, levels, settings)
         branches.log_likelihood = branches.log_likelihood + gain

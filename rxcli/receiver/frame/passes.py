@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -49,6 +50,8 @@ class Reception:
     joint: BoolArray
     #: (C,) log evidence of arbitrary slots where all columns were detected so from the start; None: by the metrics.
     free_log_evidence: FloatArray | None = None
+    #: Assignments of the copies to bursts, each with its log evidence by joint detection; none: by their similarity.
+    bursts_by_evidence: Sequence[tuple[IntArray, float]] = ()
     #: Skipped steps: name -> number of columns.
     skipped: dict[str, int] = field(default_factory=dict)
 

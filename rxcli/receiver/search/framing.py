@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.profiles import ScreenProfile
-from rxcli.protocol import PREAMBLE_SLOTS
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver import channel
 from rxcli.receiver.decode import detect
 from rxcli.receiver.decode.settings import SETTINGS as DECODE
@@ -93,14 +93,20 @@ def framing_of(
         exposed = _exposure_log_likelihood(context, acquisition, reception, screens)
         log_weight += [exposed.get(length, 0.0) for length, each in framings.items() for _ in each]
     weight = np.exp(log_weight - log_weight.max())
-    of_ways = weight[:n_own] / weight.sum()
-    ways = np.array([clock.burst for clock, _ in (likeliest, *rivals)])
-    places = own.to_copies(np.ones(own.n_slots, bool))
-    counts, bursts = places[:, PREAMBLE_SLOTS:].any(axis=1), np.zeros(int(own.burst.max()) + 1)
+    length = float(weight[:n_own].sum() / weight.sum())
+    ways, of_ways = np.array([clock.burst for clock, _ in (likeliest, *rivals)]), weight[:n_own]
+    if reception.bursts_by_evidence:
+        ways = np.array([way for way, _ in reception.bursts_by_evidence])
+        gains = SETTINGS.temper * np.array([gain for _, gain in reception.bursts_by_evidence])
+        of_ways = np.exp(gains - gains.max())
+    of_ways = length * of_ways / of_ways.sum()
+    # Part of a symbol of another packet does no harm.
+    counts = own.to_copies(np.ones(own.n_slots, bool))[:, PREAMBLE_SLOTS:].sum(axis=1) >= SLOTS_PER_SYMBOL
+    bursts = np.zeros(int(own.burst.max()) + 1)
     for burst in range(bursts.size):
         copies = ways[:, counts & (own.burst == burst)]
         bursts[burst] = of_ways[(copies == copies[:, :1]).all(axis=1)].sum()
-    return Framing(prior, float(of_ways.sum()), bursts)
+    return Framing(prior, length, bursts)
 
 
 def _framed(own: Clock, header: int, length: int) -> Clock:

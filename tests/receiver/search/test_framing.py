@@ -1,5 +1,7 @@
 """What a picture leaves open of the length of packets, and of which copies are one packet, lowers the confidence."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from row_profiles import Shot, random_link, row_profiles, sigma_of
@@ -12,7 +14,7 @@ from rxcli.receiver.frame.camera import FrameCamera
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.search import framing
 from rxcli.receiver.search.framing import Framing, framing_of
-from rxcli.receiver.still import initial_pass
+from rxcli.receiver.still import detected_on, initial_pass
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Frame, Metadata
 
@@ -23,9 +25,19 @@ PRIOR = 1 / (1 + 70 / 130 + 70 / 260)
 
 
 def framed(
-    sent: str, taken_for: str, start_slot: float, n_slots: int, names: str = "", context: FrameContext | None = None
+    sent: str,
+    taken_for: str,
+    start_slot: float,
+    n_slots: int,
+    names: str = "",
+    context: FrameContext | None = None,
+    as_one_burst: bool = False,
+    evidence: float = 0.0,
 ) -> Framing:
-    """Receive a window of slots as of a screen; `names` begins the names of the screens that are possible."""
+    """Receive a window of slots as of a screen; `names` begins the names of the screens that are possible.
+
+    All copies may be taken for one burst, and joint detection may have `evidence` of that.
+    """
     rng = np.random.default_rng(1)
     screens = {screen.name: screen for screen in SCREENS}
     own = screens[taken_for]
@@ -36,7 +48,13 @@ def framed(
     possible = tuple(screen for screen in SCREENS if screen.name.startswith(names))
     variants = tuple(screen for screen in possible if screen.packet_slots == own.packet_slots)
     acquisition = Acquisition(own, profiles, clock, variants)
-    return framing_of(acquisition, initial_pass(acquisition), possible, context)
+    reception = initial_pass(acquisition)
+    if as_one_burst:
+        as_received, one = reception.clock.burst, 0 * reception.clock.burst
+        reception = detected_on(reception, replace(reception.clock, burst=one))
+        by_evidence = [(one, evidence), (as_received, 0.0)] if evidence else []
+        reception = replace(reception, bursts_by_evidence=by_evidence)
+    return framing_of(acquisition, reception, possible, context)
 
 
 def estimate(rate_hz: float) -> tuple[FrameContext, FrameCamera]:
@@ -88,3 +106,16 @@ def test_copies_that_show_different_slots_may_be_two_packets(name: str, certaint
     found = framed("paper-8k65", name, 210 - 35.0, 66, name)
     assert found.length == pytest.approx(1.0)
     assert found.bursts == pytest.approx(certainty, abs=0.1)
+
+
+def test_less_than_a_symbol_of_another_packet_does_no_harm() -> None:
+    """Of the next packet a header and five slots are in view, and are taken for those of a copy."""
+    found = framed("paper-8k65", "paper-8k65", 210 - 72.0, 97, "paper-8k65", as_one_burst=True)
+    assert found.bursts == pytest.approx(1.0)
+    assert framed("paper-8k65", "paper-8k65", 210 - 72.0, 112, "paper-8k65", as_one_burst=True).bursts < 0.01
+
+
+@pytest.mark.parametrize(("evidence", "certainty"), [(-200.0, 0.0), (0.01, 0.5), (200.0, 1.0)])
+def test_joint_detection_says_which_copies_are_one_packet(evidence: float, certainty: float) -> None:
+    found = framed("paper-8k65", "paper-8k65", 210 - 72.0, 112, "paper-8k65", as_one_burst=True, evidence=evidence)
+    assert found.bursts == pytest.approx(certainty, abs=0.01)
