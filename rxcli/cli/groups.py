@@ -33,17 +33,6 @@ class PlainContext(click.Context):
     formatter_class = PlainFormatter
 
 
-def help_of(command: click.Command) -> str | None:
-    """The help of a command, which is a docstring; `python -OO` drops those, and it is read from the source."""
-    if command.help or command.callback is None:
-        return command.help
-    import ast
-    import inspect
-
-    tree = ast.parse(inspect.getsource(command.callback)).body[0]
-    return ast.get_docstring(tree) if isinstance(tree, ast.FunctionDef) else None
-
-
 class SuggestingGroup(click.Group):
     """A group that names the nearest command where one is mistyped, and lays out its commands' help."""
 
@@ -52,7 +41,7 @@ class SuggestingGroup(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         command = super().get_command(ctx, cmd_name)
         if command is not None:
-            command.context_class, command.help = PlainContext, help_of(command)
+            command.context_class = PlainContext
         return command
 
     def resolve_command(

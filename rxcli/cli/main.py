@@ -20,7 +20,7 @@ from typing import Any
 import click
 
 from rxcli import __version__
-from rxcli.cli.groups import SuggestingGroup, help_of
+from rxcli.cli.groups import SuggestingGroup
 from rxcli.errors import ExitCode, OutputError, ReceiverError, Terminated, is_out_of_memory, printable
 
 _COMMANDS = {
@@ -131,7 +131,6 @@ def main() -> None:
     sys.path[:] = filter(None, sys.path)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, _end)
-    cli.help = help_of(cli)
     code = run(sys.argv[1:])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run has ended, and its exit code stands
     gc.freeze()  # else the interpreter looks for garbage among all objects once more before it ends

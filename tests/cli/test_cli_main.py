@@ -122,13 +122,6 @@ def started(*command: str, **told: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*COMMAND, *command], env=ENVIRONMENT | told, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("command", ["--help", "decode --help", "calibrate --help", "calibrate shutter --help"])
-def test_help_is_the_same_without_docstrings(command: str) -> None:
-    plain, optimised = (started(*command.split(), PYTHONOPTIMIZE=level) for level in ("", "2"))
-    assert optimised.stdout == plain.stdout
-    assert optimised.returncode == 0
-
-
 def test_a_machine_without_room_for_the_libraries_is_told_so() -> None:
     photo = Path(__file__).resolve().parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
     command = f"ulimit -v 400000; exec {' '.join(COMMAND)} decode --quiet {photo}"

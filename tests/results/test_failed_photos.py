@@ -32,7 +32,7 @@ def photo(kind: str) -> bytes:
     """A JPEG as a phone may make it."""
     scene = preset("phone-plain", "data-17k3").scaled(0.4, keep_readout=True)
     if kind == "ordinary":
-        picture = load_picture("astronaut", 1600, 1200) + np.random.default_rng(1).normal(0, 2, (1200, 1600, 3))
+        picture = load_picture("astronaut", 800, 600) + np.random.default_rng(1).normal(0, 2, (600, 800, 3))
         return bytes(simplejpeg.encode_jpeg(np.clip(picture, 0, 255).astype(np.uint8), 92))
     if kind == "too dark":
         scene = replace(scene.exposed(scene.exposure_s, 1 / 2000), room=replace(scene.room, light_e_per_s=0.0))

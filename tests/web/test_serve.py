@@ -185,7 +185,7 @@ def test_a_clip_is_answered_by_and_by() -> None:
     serving(Site(receiver_options(cameras=(VIDEO_CAMERA,)), port=0), work)
 
 
-def test_who_goes_away_while_a_clip_is_read_leaves_nothing(options: ReceiverOptions) -> None:
+def test_who_goes_away_while_a_clip_is_read_leaves_nothing() -> None:
     async def work(server: Server, client: Any) -> None:
         async with client.post(server.address + "photo", data=io.BytesIO(CLIP.read_bytes()), headers=LINES) as answer:
             answer.close()
@@ -193,7 +193,7 @@ def test_who_goes_away_while_a_clip_is_read_leaves_nothing(options: ReceiverOpti
         assert (status, answer["status"]) == (200, "unreadable")
         await emptied()
 
-    serving(Site(options, port=0), work)
+    serving(Site(receiver_options(cameras=(VIDEO_CAMERA,)), port=0), work)
     assert leftovers() == []
 
 

@@ -68,7 +68,6 @@ def test_noise_is_taken_out_along_bent_rows(k1: float) -> None:
 def test_noise_is_found_as_large_as_it_was_drawn() -> None:
     """Cells that follow it halfway in one octave and wholly in the next would keep a part of each."""
     noise = find_row_noise(read_plane(frame_of(picture(0.015))))
-    assert noise is not None
     assert noise.light.std() == pytest.approx(0.015, rel=0.15)
 
 

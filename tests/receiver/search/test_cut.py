@@ -54,7 +54,6 @@ def test_a_known_camera_is_not_asked_for_less_than_an_unknown_one(
     result = FrameResult("photo", 0, 0.0, "no_signal", corners=np.zeros((4, 2)), soft_bits=own)
     received = Received(replace(result, search=(SearchStep("", 0.0, 215.0, 17.0, "won"),)), {})
     soft = receive._with_cut_packets(FrameCache(frame), received, ReceiverOptions(soft_bits=True))
-    assert soft is not None
     assert soft.llr is shown.llr
     assert soft.alternatives == (own,)
 
