@@ -1,10 +1,11 @@
 """Which numbers a result depends on, beside version, options and profiles."""
 
-from dataclasses import is_dataclass
 from hashlib import sha256
 from importlib import import_module
 from pkgutil import walk_packages
 from typing import Any
+
+import msgspec
 
 from rxcli import receiver
 from rxcli.resources import data_dir
@@ -25,4 +26,4 @@ def settings_in_force() -> str:
 
 def _is_fixed(value: Any) -> bool:
     """Whether a constant is a number, numbers, or a settings object."""
-    return isinstance(value, (int, float, tuple)) or (is_dataclass(value) and not isinstance(value, type))
+    return isinstance(value, (int, float, tuple, msgspec.Struct))

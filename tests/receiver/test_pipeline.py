@@ -263,7 +263,7 @@ def test_the_network_is_shown_what_its_time_allows(
             return denoiser.slot_corrections(scene, columns)
 
     monkeypatch.setattr(still, "_denoiser", Recording)
-    monkeypatch.setattr(still, "STILL", replace(still.STILL, max_network_slots=budget))
+    monkeypatch.setattr(still, "STILL", msgspec.structs.replace(still.STILL, max_network_slots=budget))
     taken = overexposed()
     report = received(frame_of(taken), options_for(taken)).denoiser
     assert shown == [report["columns"]]

@@ -237,7 +237,7 @@ def test_another_scene_is_searched_anew(
     clip: Clip, monkeypatch: pytest.MonkeyPatch, much_doubt: float, share: float
 ) -> None:
     """Frames held back in doubt are looked at again by their own picture, and leave that of the new scene alone."""
-    monkeypatch.setattr("rxcli.receiver.clip.ledger.SETTINGS", replace(SETTINGS, much_doubt=much_doubt))
+    monkeypatch.setattr("rxcli.receiver.clip.ledger.SETTINGS", msgspec.structs.replace(SETTINGS, much_doubt=much_doubt))
     other = simulate(8, 8, "chelsea")
     moved = tuple(replace(frame, index=6 + k, time_s=0.1 + frame.time_s) for k, frame in enumerate(other.frames))
     got = list(receive((*clip.frames[:6], *moved), clip.options))
@@ -283,7 +283,7 @@ def test_parts_of_packets_are_put_together() -> None:
 
 def test_frames_with_nothing_new_are_passed_over_on_request(monkeypatch: pytest.MonkeyPatch) -> None:
     # Longer than frames are held where the first ones leave doubt: none is passed over before.
-    monkeypatch.setattr("rxcli.receiver.clip.ledger.SETTINGS", replace(SETTINGS, frames_in_doubt=4))
+    monkeypatch.setattr("rxcli.receiver.clip.ledger.SETTINGS", msgspec.structs.replace(SETTINGS, frames_in_doubt=4))
     long = simulate(2, 14, repeats=14)
     every = list(receive(long.frames, long.options))
     thinned = list(receive(long.frames, replace(long.options, stop_when_certain=True)))

@@ -6,6 +6,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pytest
 from fake_receiver import fake_decoder
 
@@ -118,7 +119,11 @@ def test_wrong_options_end_a_run(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("screen.find._PARTS", 6), ("search.settings.SETTINGS", replace(SETTINGS, plain=399.0)), ("light._MAX_MEMORY", 4)],
+    [
+        ("screen.find._PARTS", 6),
+        ("search.settings.SETTINGS", msgspec.structs.replace(SETTINGS, plain=399.0)),
+        ("light._MAX_MEMORY", 4),
+    ],
 )
 def test_a_changed_threshold_shows_in_the_provenance(name: str, value: object, monkeypatch: pytest.MonkeyPatch) -> None:
     before = settings_in_force()

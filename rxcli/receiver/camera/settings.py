@@ -1,10 +1,9 @@
 """Numbers of policy of the estimate of an unknown camera."""
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class EstimateSettings:
+class EstimateSettings(msgspec.Struct, frozen=True):
     """Each with its unit and the reason for it."""
 
     #: Strips that a column keeps.

@@ -1,10 +1,9 @@
 """Settings of the observation model that neither physics nor the picture determine."""
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class ChannelSettings:
+class ChannelSettings(msgspec.Struct, frozen=True):
     """Thresholds, each with its unit and its reason."""
 
     #: Effective number of independent samples per slot and strip, since their errors are correlated. The confidence

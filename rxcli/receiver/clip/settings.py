@@ -1,10 +1,9 @@
 """Settings of clips: what is carried over from frame to frame, and when it is checked."""
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class ClipSettings:
+class ClipSettings(msgspec.Struct, frozen=True):
     """Each with its unit and the reason for it."""
 
     #: Exposure in slots from which slots and what is not known of the picture are decided together.

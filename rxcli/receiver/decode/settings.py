@@ -1,10 +1,9 @@
 """Settings of detection and reporting."""
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class DecodeSettings:
+class DecodeSettings(msgspec.Struct, frozen=True):
     """Thresholds, each with its unit and its reason."""
 
     #: Maximum number of slots that a symbol of a photograph's packet may miss.
@@ -48,8 +47,7 @@ class DecodeSettings:
     min_similarity: float = 0.6
 
 
-@dataclass(frozen=True, slots=True)
-class SurvivorSettings:
+class SurvivorSettings(msgspec.Struct, frozen=True):
     """Joint detection of slots and picture."""
 
     #: Most paths that are kept, and log-likelihood below the best path at which one is dropped.

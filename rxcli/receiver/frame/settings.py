@@ -1,10 +1,9 @@
 """Settings of the presence of packets, and of the passes of a still."""
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class PassSettings:
+class PassSettings(msgspec.Struct, frozen=True):
     """Thresholds, each with its unit and its reason."""
 
     #: Log-likelihood ratio of headers and packets below which a picture contains no packets: without data it is below
@@ -18,8 +17,7 @@ class PassSettings:
     min_headerless_llr: float = 60.0
 
 
-@dataclass(frozen=True, slots=True)
-class StillSettings:
+class StillSettings(msgspec.Struct, frozen=True):
     """Thresholds, each with its unit and its reason."""
 
     #: Samples per slot of the first passes.

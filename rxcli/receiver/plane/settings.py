@@ -1,10 +1,9 @@
 """Settings of colours that blink and of row noise, each with its unit and the reason for it."""
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class ColourSettings:
+class ColourSettings(msgspec.Struct, frozen=True):
     """Numbers of policy by which red that lags is left out."""
 
     #: Cells across a picture, their width in pixels, and rows of a block, in which each is dark and lit once.
@@ -26,8 +25,7 @@ class ColourSettings:
     clipped: float = 0.98
 
 
-@dataclass(frozen=True, slots=True)
-class RowNoiseSettings:
+class RowNoiseSettings(msgspec.Struct, frozen=True):
     """Numbers of policy by which the noise of sensor rows is found."""
 
     #: Cells across a picture, and their width in pixels.

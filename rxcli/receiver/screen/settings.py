@@ -1,10 +1,9 @@
 """Settings of the registration of clips, each with its unit and the reason for it."""
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class ScreenSettings:
+class ScreenSettings(msgspec.Struct, frozen=True):
     """Numbers of policy of the registration of a clip's frames by the texture of the screen.
 
     A screen's size is its width, or the width that its height implies.

@@ -1,10 +1,9 @@
 """Settings of the search: outlines, weight of evidence, end of the search, distance of rivals, light without data."""
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class SearchSettings:
+class SearchSettings(msgspec.Struct, frozen=True):
     """Settings of the search. Evidence is a log-likelihood ratio for a screen of twenty columns."""
 
     #: Weight of evidence in the score, because errors of samples are correlated.

@@ -1,10 +1,9 @@
 """Settings of clock recovery, burst assignment and the link time of a clip."""
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class SyncSettings:
+class SyncSettings(msgspec.Struct, frozen=True):
     """Thresholds, each with its unit and its reason."""
 
     #: Samples per slot of the clock search.

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from rxcli.receiver.light import exposed_from
 from rxcli.types import BurstSamples
 
 Q, STRIPS = 2, 4
-EVERY_PATH = replace(SURVIVORS, max_paths=2000, max_lag=1e6)
+EVERY_PATH = msgspec.structs.replace(SURVIVORS, max_paths=2000, max_lag=1e6)
 
 
 def packet(index: NDArray[np.int64], w: int) -> NDArray[np.int64]:
@@ -154,7 +155,7 @@ def test_few_paths_are_enough_and_packets_beat_arbitrary_slots() -> None:
     rng = np.random.default_rng(10)
     index = rng.integers(0, 128, (4, 5))
     burst = samples([packet(i, 5) for i in index], 4.0, rng, 0.02, 0.05)
-    few, many = detect(burst), detect(burst, replace(SURVIVORS, max_paths=300, max_lag=80))
+    few, many = detect(burst), detect(burst, msgspec.structs.replace(SURVIVORS, max_paths=300, max_lag=80))
     assert np.array_equal(few.index, many.index)
     assert (few.log_evidence > free_log_evidence(burst)).all()
     other = rng.integers(0, 2, (4, 80)).astype(np.int64)

@@ -1,10 +1,9 @@
 """Settings of the picture known from earlier frames."""
 
-from dataclasses import dataclass
+import msgspec
 
 
-@dataclass(frozen=True, slots=True)
-class KnownPictureSettings:
+class KnownPictureSettings(msgspec.Struct, frozen=True):
     """Thresholds, each with its unit and its reason."""
 
     #: Forgetting factor: share of its weight that a frame keeps with each later frame.
