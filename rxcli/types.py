@@ -51,6 +51,8 @@ class Metadata:
     model: str | None = None
     lens: str | None = None
     exposure_s: float | None = None
+    #: Time from the first row of a frame to the last, as the camera states it: right to several per cent.
+    readout_s: float | None = None
     iso: float | None = None
     focal_length_mm: float | None = None
     focal_length_35mm: float | None = None

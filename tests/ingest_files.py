@@ -57,6 +57,10 @@ def write_clip(path: Path, codec: str = "libx264", form: str = "yuv420p", **opti
         container.metadata.update(options.get("tags", {}))
         stream = container.add_stream(codec, rate=RATE, options=QUIET.get(codec, {}) | options.get("encoder", {}))
         stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, form
+        if "payload" in options:
+            packet = av.Packet(options["payload"])
+            packet.stream, packet.pts, packet.dts = container.add_data_stream("bin_data"), 0, 0
+            packet.time_base, packet.duration, packet.is_keyframe = Fraction(1, 1000), 1000, True
         if "rotation" in options:
             stream.set_display_rotation(options["rotation"])
         for _ in range(N_FRAMES):
@@ -69,6 +73,8 @@ def write_clip(path: Path, codec: str = "libx264", form: str = "yuv420p", **opti
             planes.append(_fill(frame, picture << (bits - 8)))
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
+        if "payload" in options:
+            container.mux(packet)
     return planes
 
 

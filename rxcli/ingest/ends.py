@@ -16,7 +16,7 @@ def is_cut(path: Path, container: str) -> bool:
     """
     if container == "mpegts":
         return _ends_within_packet(path)
-    size_of = _box if "mp4" in container else _element
+    size_of = box_size if "mp4" in container else _element
     part, length = 0, path.stat().st_size
     with path.open("rb") as file:
         while part < length and (size := size_of(file.read(16))):
@@ -25,7 +25,7 @@ def is_cut(path: Path, container: str) -> bool:
     return part > length
 
 
-def _box(head: bytes) -> int:
+def box_size(head: bytes) -> int:
     """Size of a box of MP4 and MOV (ISO/IEC 14496-12, section 4.2); 0: to the end of the file, or some trailer."""
     size = int.from_bytes(head[:4])
     size = int.from_bytes(head[8:]) if size == 1 else size

@@ -38,6 +38,7 @@ _MAX_CHARACTERS = 200
 #: Plausible ranges: field -> name, minimum, maximum, unit. An exposure of a second is thousands of slots.
 _BOUNDS = {
     "exposure_s": ("exposure", 1e-7, 1.0, "s"),
+    "readout_s": ("readout", 1e-4, 0.2, "s"),
     "iso": ("ISO", 0.1, 1e8, ""),
     "focal_length_mm": ("focal length", 0.01, 1e5, "mm"),
     "focal_length_35mm": ("focal length", 0.01, 1e5, "mm"),

@@ -20,8 +20,9 @@ from rxcli.errors import InputError, reason_of
 from rxcli.ingest.ahead import read_ahead
 from rxcli.ingest.damage import WholeFrames
 from rxcli.ingest.ends import is_cut
+from rxcli.ingest.gpmf import stated_readout_s
 from rxcli.ingest.luma import BT601, BT709, THINNED
-from rxcli.ingest.metadata import clip_metadata
+from rxcli.ingest.metadata import believed, clip_metadata
 from rxcli.ingest.orientation import orientation_of_turn
 from rxcli.ingest.sniff import MAX_BYTES, check_size, damage_explained
 from rxcli.ingest.times import FrameTimes
@@ -139,6 +140,7 @@ def _pixel_bytes(stream: Any) -> float:
 
 def _frames(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
     metadata = clip_metadata(dict(container.metadata) | dict(stream.metadata))
+    metadata = believed(replace(metadata, readout_s=stated_readout_s(path, container, _FILES_ONLY)))
     decode = _decode_mjpeg if stream.codec_context.name == "mjpeg" else _decode
     for n_whole, frame in enumerate(decode(path, container, stream, progress)):
         progress.last_time_s = frame.time_s

@@ -1,6 +1,7 @@
 """Clips: luma planes, levels, times, orientation, and what is left of a clip that breaks off."""
 
 import gc
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,50 @@ def test_camera_and_rotation_are_noted(tmp_path: Path, name: str, options: dict[
     frames, _ = read_all(tmp_path / name)
     assert {frame.metadata for frame in frames} == {expected}
     assert frames[0].pixels.shape == (HEIGHT, WIDTH)  # never turned
+
+
+def gpmf_entry(key: bytes, kind: bytes, data: bytes) -> bytes:
+    size = 1 if kind == b"\0" else len(data)
+    return struct.pack(">4scBH", key, kind, size, len(data) // size) + data + bytes(-len(data) % 4)
+
+
+def box(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I4s", len(data) + 8, name) + data
+
+
+def gpmf(*entries: bytes) -> bytes:
+    """A payload of GoPro's metadata: a name, whose length is no multiple of four, and a stream."""
+    stream = gpmf_entry(b"STRM", b"\0", b"".join(entries))
+    return gpmf_entry(b"DEVC", b"\0", gpmf_entry(b"DVNM", b"c", b"Hero7 Black") + stream)
+
+
+READOUT = gpmf_entry(b"SROT", b"f", struct.pack(">f", 15.12))
+
+
+@pytest.mark.parametrize(
+    ("in_track", "in_header", "expected"),
+    [
+        (gpmf(gpmf_entry(b"TSMP", b"L", bytes(4)), READOUT), b"", 15.12e-3),
+        (gpmf(), gpmf(READOUT), 15.12e-3),
+        (gpmf(), gpmf(), None),
+        (gpmf(READOUT)[:-2], b"", None),
+        (gpmf(gpmf_entry(b"SROT", b"f", struct.pack(">f", 15e3))), b"", None),
+    ],
+    ids=["track", "header", "none", "cut", "absurd"],
+)
+def test_the_readout_that_a_gopro_states(
+    tmp_path: Path, in_track: bytes, in_header: bytes, expected: float | None
+) -> None:
+    path = tmp_path / "a.mp4"
+    write_clip(path, payload=in_track)
+    if in_header:  # the index is the last box of the file, so that it may grow
+        data = path.read_bytes()
+        index = data.rindex(b"moov") + 4
+        path.write_bytes(data[: index - 8] + box(b"moov", box(b"udta", box(b"GPMF", in_header)) + data[index:]))
+    frames, error = read_all(path)
+    assert error is None
+    assert len(frames) == N_FRAMES
+    assert frames[0].metadata.readout_s == (expected and pytest.approx(expected))
 
 
 LAYOUTS = [

@@ -82,10 +82,19 @@ def propose_cameras(
     screens = sorted(options.screens, key=lambda screen: -screen.slot_rate_hz)
     with timer("blind"):
         hypotheses = propose(strips, screens, frame.metadata.exposure_s, may_bend=may_bend and frame.mosaic is None)
-    for hypothesis in sorted(hypotheses, key=lambda h: h.number):
-        screen = next(s for s in screens if s.packet_slots == hypothesis.packet_slots)
-        yield estimated_camera(hypothesis, screen.slot_rate_hz, frame)
+    rates = {screen.packet_slots: screen.slot_rate_hz for screen in reversed(screens)}
+    ranked = sorted(hypotheses, key=lambda hypothesis: hypothesis.number)
+    cameras = [estimated_camera(hypothesis, rates[hypothesis.packet_slots], frame) for hypothesis in ranked]
+    yield from [camera for camera in cameras if has_stated_readout(camera, frame)] or cameras
     return Failure("no_signal", why_not(strips))
+
+
+def has_stated_readout(camera: FrameCamera, frame: Frame) -> bool:
+    """Whether a file states a readout and an estimated camera has it, about."""
+    stated_s = frame.metadata.readout_s
+    if stated_s is None:
+        return False
+    return bool(abs(np.log(camera.line_delay_s * frame.height / stated_s)) < SETTINGS.near_readouts)
 
 
 def cameras_by_slots(

@@ -22,7 +22,7 @@ from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.cameras import UNKNOWN, cameras_by_slots, estimated_camera, relabelled_camera, settle_slots
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.receiver.still import decode, detected_on, initial_pass, slots_of_any_kind
+from rxcli.receiver.still import decode, detected_on, initial_pass, llr_of, slots_of_any_kind
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Clock, Float32Array, FrameSoftBits
 
@@ -37,8 +37,9 @@ class _Slots:
     context: FrameContext
     #: On the clock of a long packet whose payload is all that is in view.
     acquisition: Acquisition
-    #: (C, N) probability that each slot is lit; and log evidence of a slot against the unlikeliest phase.
+    #: (C, N) probability that each slot is lit; log evidence, and that of a slot against the unlikeliest phase.
     lit: Float32Array
+    log_evidence: float
     lead: float
     #: Screens that may send them.
     screens: Sequence[ScreenProfile]
@@ -50,7 +51,7 @@ class _Candidate:
 
     context: FrameContext
     acquisition: Acquisition
-    #: See `evidence.fit`, of the middle columns; a header in view has to earn its place.
+    #: See `evidence.fit`; a header in view has to earn its place.
     fit: float
     is_open: bool
 
@@ -114,6 +115,26 @@ def _cameras(context: FrameContext) -> Iterable[FrameContext]:
 
 
 def _slots_by(context: FrameContext) -> Iterator[_Slots]:
+    """The slots of a context by the exposure that the light shows, if they stand out and are a part of a packet."""
+    found = [slots for by_exposure in _exposures(context) for slots in _at_likeliest_phase(by_exposure)]
+    if found:
+        found.sort(key=lambda slots: -slots.log_evidence)
+        likely = [slots for slots in found if slots.log_evidence > found[0].log_evidence - SETTINGS.cut_rate]
+        screens = tuple(screen for slots in likely for screen in slots.screens)
+        yield replace(found[0], context=replace(found[0].context, screens=screens), screens=screens)
+
+
+def _exposures(context: FrameContext) -> list[FrameContext]:
+    """The frame by each exposure that the file may state: in seconds, so that it has other slots by each slot rate."""
+    if context.camera.hypothesis is None or not context.frame.metadata.exposure_s:
+        return [context]
+    rates = dict.fromkeys(screen.slot_rate_hz for screen in context.screens)
+    groups = [tuple(screen for screen in context.screens if screen.slot_rate_hz == rate) for rate in rates]
+    cameras = [relabelled_camera(context.camera, screens[0], context.frame) for screens in groups]
+    return [replace(context, camera=camera, screens=own) for camera, own in zip(cameras, groups, strict=True)]
+
+
+def _at_likeliest_phase(context: FrameContext) -> Iterator[_Slots]:
     """The slots by the first screen of a context at their likeliest phase, if it stands out and they are a part."""
     screen, camera = context.screens[0], context.camera
     profiles = context.sample_columns(screen.columns)
@@ -145,8 +166,8 @@ def _slots_by(context: FrameContext) -> Iterator[_Slots]:
     beside = peak_offset(*np.take(evidence_of, [best - 1, best, best + 1], mode="wrap"))
     clock = replace(clocks[best], row0=clocks[best].row0 - float(np.clip(beside, -0.5, 0.5)) * step)
     ((lit, log_evidence),) = slots_of_any_kind(acquisition, [clock])
-    lead = (log_evidence - min(evidence_of)) / n_slots
-    yield _Slots(context, replace(acquisition, clock=clock), clock.on_grid(lit[None]), lead, context.screens)
+    lead, lit = (log_evidence - min(evidence_of)) / n_slots, clock.on_grid(lit[None])
+    yield _Slots(context, replace(acquisition, clock=clock), lit, log_evidence, lead, context.screens)
 
 
 def _settled(slots: _Slots, outline: Outline) -> _Slots:
@@ -160,7 +181,7 @@ def _settled(slots: _Slots, outline: Outline) -> _Slots:
             layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
             outline = replace(outline, corners=corners_by_slots(outline, layout, clock, slots.lit, lens))
         context = replace(context, camera=camera, sampled_corners=outline.corners)
-        better = next(_slots_by(context), slots)
+        better = next(_at_likeliest_phase(context), slots)
         if better.lead <= slots.lead:
             break
         slots = better
@@ -188,7 +209,9 @@ def _candidates(slots: _Slots) -> Iterator[_Candidate]:
         context = replace(slots.context, camera=camera, screens=(screen,))
         clock = replace(clock, exposure_slots=camera.exposure_s * screen.slot_rate_hz)
         acquisition = replace(slots.acquisition, screen=screen, variants=(screen,), clock=clock)
-        initial = initial_pass(acquisition.of_columns(acquisition.middle_columns))
+        initial = initial_pass(acquisition)
+        of_slots = channel.metrics_of(llr_of(slots.lit), initial.model.exposure.isi_memory)
+        initial = replace(initial, metrics=(initial.metrics + of_slots) / 2)
 
         # Packets of any length: longer by a symbol than what is in view, as the first one may begin before the picture.
         longer = clock.packet_slots + SLOTS_PER_SYMBOL
@@ -219,9 +242,11 @@ def _started(clock: Clock, first_slot: int, packet_slots: int) -> Clock:
 def _distinct(candidates: Iterable[_Candidate]) -> list[_Candidate]:
     """The likeliest few whose symbols begin at different places; none that fits no better than noise."""
     out: list[_Candidate] = []
-    fitting = (candidate for candidate in candidates if candidate.fit > SETTINGS.cut_fit)
-    for candidate in sorted(fitting, key=lambda candidate: -candidate.fit):
-        if len(out) < SETTINGS.max_cut and not any(candidate.is_near(better) for better in out):
+    for candidate in sorted(candidates, key=lambda candidate: -candidate.fit):
+        least = max(SETTINGS.cut_fit, out[0].fit - SETTINGS.cut_reach if out else -np.inf)
+        if candidate.fit < least or len(out) == SETTINGS.max_cut:
+            break
+        if not any(candidate.is_near(better) for better in out):
             out.append(candidate)
     return out
 

@@ -86,7 +86,10 @@ def framing_of(
     is_plain = all(likeliest[1] - rival[1] > sync_settings.settled_llr for rival in rivals)
     if len(lengths) == 1 and is_plain and np.array_equal(likeliest[0].burst, own.burst):
         return Framing(prior, 1.0, np.ones(int(own.burst.max()) + 1))
-    log_weight = np.array([_log_weight(reception, *framing) for each in framings.values() for framing in each])
+    # Only the similarity of copies shows which of them are one packet.
+    log_weight = np.concatenate(
+        [_log_weight(reception, each[0][0]) + np.array([similar for _, similar in each]) for each in framings.values()]
+    )
     n_own = 1 + len(rivals)
     odds = float(np.logaddexp.reduce(log_weight[:n_own]) - np.logaddexp.reduce(log_weight[n_own:]))
     if abs(odds) < _MAX_LOG_ODDS - SETTINGS.min_exposure_llr:  # else no exposure outweighs what the slots show
@@ -139,8 +142,8 @@ def _exposure_log_likelihood(
     return out
 
 
-def _log_weight(reception: Reception, clock: Clock, of_copies: float) -> float:
-    """Log-likelihood of a framing and its prior."""
+def _log_weight(reception: Reception, clock: Clock) -> float:
+    """Log-likelihood of the length of packets and its prior."""
     posteriors = detected(reception.metrics, clock)
     framed = replace(reception, clock=clock, posteriors=posteriors, free_log_evidence=None)
-    return SETTINGS.temper * evidence.log_evidence(framed) + of_copies - float(np.log(clock.packet_slots))
+    return SETTINGS.temper * evidence.log_evidence(framed) - float(np.log(clock.packet_slots))

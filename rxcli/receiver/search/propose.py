@@ -14,7 +14,7 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.screen.outline import Outline
-from rxcli.receiver.search.cameras import known_camera, propose_cameras, relabelled_camera
+from rxcli.receiver.search.cameras import has_stated_readout, known_camera, propose_cameras, relabelled_camera
 from rxcli.receiver.search.evidence import USUAL_COLUMNS
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.settings import SETTINGS
@@ -89,9 +89,10 @@ class Proposer:
         return self.known.screens if self.known else self.options.screens
 
     def possible_screens(self, best: Hypothesis) -> tuple[ScreenProfile, ...]:
-        """Screens that the camera of a hypothesis may have seen: an estimated one does not show the slot rate."""
-        is_estimated, rate = best.camera.profile is None, best.screen.slot_rate_hz
-        return tuple(screen for screen in self.options.screens if is_estimated or screen.slot_rate_hz == rate)
+        """Screens that the camera of a hypothesis may have seen: without its readout any slot rate is possible."""
+        shows_rate = best.camera.profile is not None or has_stated_readout(best.camera, self.cache.frame)
+        rate = best.screen.slot_rate_hz
+        return tuple(screen for screen in self.options.screens if screen.slot_rate_hz == rate or not shows_rate)
 
     def _hypothesis(self, outline: Outline, camera: FrameCamera, screen: ScreenProfile, log_prior: float) -> Hypothesis:
         variants = variants_of(screen, self.options.screens)

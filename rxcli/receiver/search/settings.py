@@ -57,24 +57,31 @@ class SearchSettings(msgspec.Struct, frozen=True):
     #: Largest size of an outline relative to the picture, beyond which less than one column is visible.
     largest_outline: float = 50.0
 
-    #: Less than a packet in view: fewest symbols, phases of a slot that are tried, clocks that are handed on, log
-    #: evidence by which a start with a part of the header in view must lead, least log-likelihood ratio of a column,
+    #: Less than a packet in view: fewest symbols, phases of a slot that are tried, clocks that are handed on, fit by
+    #: which a start with a part of the header in view must lead, as one dark slot gives 14, and by which the last one
+    #: may be behind the first, least log-likelihood ratio of a column,
     #: and least fit of a clock: noise has 20 times that of a column; fits of outline and camera; lead a slot below
     #: which a camera profile may be wrong: by right ones pictures reach 22 to 51, by ones that are 1 % off 8 to 14.
     cut_symbols: int = 2
     cut_phases: int = 4
     max_cut: int = 4
-    cut_start: float = 10.0
+    cut_start: float = 60.0
+    cut_reach: float = 300.0
     worst_fit: float = -60.0
     cut_fit: float = -1050.0
     cut_fits: int = 3
     poor_lead: float = 16.0
+    #: Log evidence by which one exposure of the slots excludes another: right ones lead by -2 to 2100 over half of it,
+    #: by 1300 and more over twice of it.
+    cut_rate: float = 300.0
     #: Least log evidence of a slot against the unlikeliest phase: light without slots has 0.4, cut packets 18 and more.
     cut_lead: float = 1.0
     #: Room light that is tried where no header is in view, relative to its estimate, which counts what is lit in part.
     cut_room_lights: tuple[float, ...] = (1.0, 0.8, 0.6)
     #: Natural logarithm of the ratio of exposures, stated and by the width of stripes, up to which they may agree.
     near_exposures: float = 0.7
+    #: The same of readouts: cameras state that of the sensor, and a frame may show a part of it.
+    near_readouts: float = 0.3
 
     #: Fits of the exposure; shortest one, slots, that the light shows; standard deviation of its logarithm; and least
     #: log-likelihood, as files may state wrong ones.

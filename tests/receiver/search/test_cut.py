@@ -11,6 +11,7 @@ from row_profiles import Shot, random_link, row_profiles
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.receiver import receive
+from rxcli.receiver.camera import CameraHypothesis
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.camera import FrameCamera
@@ -19,9 +20,10 @@ from rxcli.receiver.frame.result import Received
 from rxcli.receiver.frame.timer import Timer
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import cut
+from rxcli.receiver.search.cameras import estimated_camera, relabelled_camera
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
-from rxcli.types import Clock, Frame, FrameResult, FrameSoftBits, RowProfiles, SearchStep
+from rxcli.types import Clock, Frame, FrameResult, FrameSoftBits, Metadata, RowProfiles, SearchStep
 
 SCREEN = load_profile("data-17k3", ScreenProfile)
 
@@ -83,6 +85,21 @@ def test_the_start_of_a_cut_packet_is_found_on_a_textured_picture(
     assert best.is_open == is_open
     assert (off + 5) % 10 - 5 == pytest.approx(0, abs=0.13)
     assert is_open or off == pytest.approx(0, abs=0.13)
+
+
+def test_the_light_shows_which_slot_rate_the_stated_exposure_is_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file states seconds, the light shows slots: at 34.6 kHz they would be exposed for twice as many."""
+    rng, faster = np.random.default_rng(6), load_profile("data-34k6", ScreenProfile)
+    shot = Shot(8.0, 0.7, 33.0, 560, texture=0.2, crosstalk=0.1)
+    (known,) = seen(monkeypatch, [row_profiles(random_link(rng, [5] * 20, SCREEN.payload_symbols), shot, rng)])
+    frame = replace(known.frame, metadata=Metadata(exposure_s=0.7 / SCREEN.slot_rate_hz))
+    hypothesis = CameraHypothesis(8.0, 0, False, np.zeros(4), 1.0, 0.0, 0.0, np.zeros(4))
+    camera = relabelled_camera(estimated_camera(hypothesis, faster.slot_rate_hz, frame), faster, frame)
+    cache = cast(FrameCache, SimpleNamespace(frame=frame, timer=Timer()))
+    context = replace(known, cache=cache, camera=camera, screens=(faster, SCREEN))
+    (slots,) = cut._slots_by(context)
+    assert slots.screens == (SCREEN,)
+    assert slots.acquisition.clock.exposure_slots == pytest.approx(0.7)
 
 
 def test_columns_are_told_apart_by_the_right_outline(monkeypatch: pytest.MonkeyPatch) -> None:

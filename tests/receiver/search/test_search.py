@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -20,17 +20,19 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, usual_screens
 from rxcli.receiver import camera as blind
 from rxcli.receiver.frame.cache import FrameCache
+from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.receive import receive_frame
 from rxcli.receiver.screen.grid import grid_between
 from rxcli.receiver.screen.outline import Outline
-from rxcli.receiver.search import Found, outlines, search
+from rxcli.receiver.search import Found, cameras, outlines, search
 from rxcli.receiver.search.evidence import distinct_share
+from rxcli.receiver.search.hypothesis import Hypothesis
 from rxcli.receiver.search.numbers import less_likely_outlines
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.search import _Walk
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import Frame, FrameResult
+from rxcli.types import Frame, FrameResult, Metadata
 
 SHIPPED = usual_screens()
 
@@ -252,3 +254,30 @@ def test_columns_that_stand_out_more_upright_do_not_lie_on_their_side(
     monkeypatch.setattr(outlines.find, "find_screens", lambda *_: [[lying]])
     monkeypatch.setattr(outlines, "stripe_lean", lambda _: 0.5)
     assert outlines._lean(FrameCache(Frame(np.zeros((200, 240), np.uint8), "memory")), [], upright) == lean
+
+
+@pytest.mark.parametrize(
+    ("stated_s", "rates_hz"),
+    [(None, [34600, 17300, 8650]), (1000 / (4 * 17300) * 1.07, [17300]), (0.2, [34600, 17300, 8650])],
+    ids=["none", "7 % off", "of no screen"],
+)
+def test_a_stated_readout_shows_the_slot_rate(
+    stated_s: float | None, rates_hz: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A picture shows rows per slot; the readout makes seconds of them, and the estimate stays that of the picture."""
+    frame = Frame(np.zeros((1000, 40), np.uint8), "clip", metadata=Metadata(readout_s=stated_s))
+    ways = (
+        blind.CameraHypothesis(4.0, length, False, np.zeros(4), 1.0, 9.0, 0.1, np.zeros(4), number=-length)
+        for length in (70, 130, 260)
+    )
+    monkeypatch.setattr(cameras, "propose", lambda *_, **__: list(ways))
+    monkeypatch.setattr(cameras, "_strips", lambda *_: None)
+    monkeypatch.setattr(cameras, "why_not", lambda *_: "")
+    monkeypatch.setattr(FrameContext, "sample_columns", lambda *_: None)
+    options = ReceiverOptions(screens=tuple(screen for screen in SHIPPED if screen.columns == 20))
+    proposed = list(cameras.propose_cameras(FrameCache(frame), np.zeros((4, 2)), options, 20))
+    assert [round(1 / (4.0 * camera.line_delay_s)) for camera in proposed] == rates_hz
+    proposer = Proposer(FrameCache(frame), options, ())
+    best = cast(Hypothesis, SimpleNamespace(camera=proposed[0], screen=next(iter(options.screens))))
+    rates = {screen.slot_rate_hz for screen in proposer.possible_screens(best)}
+    assert len(rates) == (1 if len(rates_hz) == 1 else 3)
