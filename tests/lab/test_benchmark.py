@@ -155,8 +155,8 @@ def test_an_interrupted_run_goes_on(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_workers_end_with_the_processes_that_they_started(tmp_path: Path) -> None:
-    command = ["benchmark", "stability", "--count", "1", "--jobs", "2", "--out", str(tmp_path), "--quiet"]
-    command += ["--way", cases.OTHER_KERNEL]  # the one that starts a process
+    command = ["benchmark", "stability", "--only", "all named", "--count", "2", "--jobs", "2", "--quiet"]
+    command += ["--way", cases.OTHER_KERNEL, "--out", str(tmp_path)]  # the way that starts a process
     done = subprocess.run([sys.executable, "-m", "rxcli.cli.main", *command], timeout=120, check=False)
     assert done.returncode == 0
     assert len(load_journal(tmp_path / "stability.journal.jsonl")) == 2

@@ -215,8 +215,8 @@ def test_shipped_models_contradict_wrong_beliefs(name: str) -> None:
     assert towards[wrong].mean() > towards[~wrong].mean() + 0.5
 
 
-#: The first validation frame of each scene class with doubtful columns.
-DOUBTFUL_FRAMES = (2, 3, 4, 5, 19, 36)
+#: The first validation frames of four scene classes with doubtful columns.
+DOUBTFUL_FRAMES = (3, 4, 19, 36)
 
 
 def cross_entropy(sample: Sample, corrections: np.ndarray) -> float:
