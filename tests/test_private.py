@@ -67,14 +67,7 @@ def test_the_filter_ends_what_opens_an_internet_socket(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "names",
-    [
-        ["phone_chelsea_17k3.jpg"],
-        ["xtrans_sky_17k3.dng"],
-        ["video1080_chelsea_17k3.mp4"],
-        ["phone_chelsea_17k3.jpg", "xtrans_sky_17k3.dng"],
-    ],
-    ids=["JPEG", "DNG", "MP4", "folder"],
+    "names", [["video1080_chelsea_17k3.mp4"], ["phone_chelsea_17k3.jpg", "xtrans_sky_17k3.dng"]], ids=["MP4", "folder"]
 )
 def test_a_decode_writes_its_outputs_and_talks_to_nobody(tmp_path: Path, names: list[str]) -> None:
     """The auto-encoder runs, whose library by itself reports to its maker and keeps a device id."""

@@ -30,7 +30,6 @@ _RUN = (
     ("--jobs", click.IntRange(1, 256), 1, "Processes, one thread each."),
     _OUT,
     _SEED,
-    ("--fresh", None, False, "Forget what an earlier run has left in the journal."),
     _QUIET,
 )
 
@@ -39,11 +38,9 @@ class _Scenarios(SuggestingGroup):
     """A command for every row of the table of scenarios."""
 
     def list_commands(self, context: click.Context) -> list[str]:
-
         return [*(name for name in scenarios() if name != "quick"), *super().list_commands(context)]
 
     def get_command(self, context: click.Context, name: str) -> click.Command | None:
-
         if name not in scenarios():
             return super().get_command(context, name)
         command = click.pass_context(_run_scenario)
@@ -60,13 +57,10 @@ _RECEPTION = (
 )
 
 
-def _begin(name: str, out: Path, fresh: bool, jobs: int, quiet: bool) -> Run:
+def _begin(name: str, out: Path, jobs: int, quiet: bool) -> Run:
     """A run that keeps its journal in the folder of results."""
     claim_own_folder("--out", out, ("*.journal.jsonl",))
-    path = out / f"{name}.journal.jsonl"
-    if fresh:
-        path.unlink(missing_ok=True)
-    return Run(path, jobs, quiet)
+    return Run(out / f"{name}.journal.jsonl", jobs, quiet)
 
 
 def _chosen(name: str, captures: Path | None, only: tuple[str, ...], ways: tuple[str, ...] = ()) -> Scenario:
@@ -86,7 +80,7 @@ def _chosen(name: str, captures: Path | None, only: tuple[str, ...], ways: tuple
 def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given: Any) -> int:
     name, out = str(context.info_name), given["out"]
     scenario = _chosen(name, given["captures"], given["only"], given["ways"])
-    run = _begin(name, out, given["fresh"], given["jobs"], given["quiet"])
+    run = _begin(name, out, given["jobs"], given["quiet"])
     more = {"save": str(given["save"])} if given["save"] else {}
     count = given["count"] or scenario.count
     tasks = scenario.tasks(given["seed"], count, out / "media", cae=given["cae"], **more)

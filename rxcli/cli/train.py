@@ -27,7 +27,6 @@ CALIBRATION_SAMPLES = 12
     ("--strip-width", click.IntRange(1), 32, "Channels of a strip."),
     ("--column-width", click.IntRange(1), 48, "Channels of a column."),
     ("--seed", click.IntRange(0), 1, "Same seed, same network."),
-    ("--cache", FOLDER, None, "Folder of the data sets.  [default: OUT/data]"),
     ("--int8/--float quantise", None, True, "Compute in eight-bit integers, or not.", {"show_default": True}),
     ("-q --quiet", None, False, "No progress bars."),
 )
@@ -46,9 +45,9 @@ def train(out: Path, **options: Any) -> None:
     from rxcli.lab.training import dataset, export, fit
     from rxcli.outputs import claim_own_folder
 
-    data, progress = options["cache"] or out / "data", not options["quiet"]
+    data, progress = out / "data", not options["quiet"]
     claim_own_folder("OUT", out, ("model.toml",))
-    claim_own_folder("--cache", data, ("frames-*", "validation"))
+    claim_own_folder("OUT", data, ("frames-*", "validation"))
     shape = fit.Shape(strip_width=options["strip_width"], column_width=options["column_width"])
     recipe = fit.Recipe(shape=shape, steps=options["steps"], seed=options["seed"])
     samples = dataset.frame_samples(options["frames"], options["seed"], data, progress=progress)

@@ -118,10 +118,6 @@ def test_no_module_is_taken_from_the_current_folder(way: str, tmp_path: Path) ->
     assert not (tmp_path / "loaded").exists()
 
 
-def started(*command: str, **told: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*COMMAND, *command], env=ENVIRONMENT | told, capture_output=True, text=True, check=False)
-
-
 def test_a_machine_without_room_for_the_libraries_is_told_so() -> None:
     photo = Path(__file__).resolve().parents[2] / "sample_frames" / "phone_chelsea_17k3.jpg"
     command = f"ulimit -v 400000; exec {' '.join(COMMAND)} decode --quiet {photo}"
