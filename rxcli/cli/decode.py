@@ -1,5 +1,7 @@
 """`vlc-rx decode`: photos, RAW files, clips and folders. Here are its options; `rxcli.cli.decoding` does the work."""
 
+import os
+from contextlib import suppress
 from typing import Any
 
 import click
@@ -37,6 +39,21 @@ from rxcli.cli.kinds import FILE, FOLDER, SHARE
 @force_argument
 def decode(paths: tuple[str, ...], **options: Any) -> int:
     """Decode photos, RAW files and clips; PATH may be a folder, or - for one picture on stdin."""
+    opened = None
+    if options["workers"] == 1 and not (options["cluster"] or options["resume"]) and _is_jpeg(paths[0]):
+        # A large photo takes longer than what is imported meanwhile.
+        from rxcli.ingest import begun
+
+        opened = begun(paths[0])
     from rxcli.cli.decoding import run
 
-    return run(paths, options)
+    return run(paths, options, opened)
+
+
+def _is_jpeg(path: str) -> bool:
+    """Whether a path is that of a file which begins as a JPEG picture."""
+    with suppress(OSError, ValueError):
+        if os.path.isfile(path):
+            with open(path, "rb") as file:
+                return file.read(2) == b"\xff\xd8"
+    return False

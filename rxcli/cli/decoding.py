@@ -43,8 +43,8 @@ STDIN = "-"
 _STDIN_BYTES = 1 << 20
 
 
-def run(paths: tuple[str, ...], given: dict[str, Any]) -> ExitCode:
-    """Decode the files and folders `paths` with the options that were `given`."""
+def run(paths: tuple[str, ...], given: dict[str, Any], opened: batch.OpenSource | None = None) -> ExitCode:
+    """Decode the files and folders `paths` with the options that were `given`; `opened` opens files in this process."""
     sources = batch.collect_sources(paths, frozenset(KNOWN_SUFFIXES))
     _check(paths, given, len(sources))
     log.info("paths: %s", ", ".join(paths))
@@ -60,7 +60,8 @@ def run(paths: tuple[str, ...], given: dict[str, Any]) -> ExitCode:
     with _stdin_as_file(sources) as sources:
         if given["same_camera"]:
             configured = _with_same_camera(sources, configured)
-        return _Run(batch.standard_decoder(configured, tap, after), given, taken, sources).run()
+        decoder = batch.standard_decoder(configured, tap, after)
+        return _Run(decoder if opened is None else replace(decoder, open_source=opened), given, taken, sources).run()
 
 
 def _with_same_camera(sources: list[batch.Source], configured: ReceiverOptions) -> ReceiverOptions:

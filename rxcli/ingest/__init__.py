@@ -3,14 +3,16 @@
 Readers are imported when a file of their kind comes, because each brings a heavy library.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
+from threading import Thread
 
 from rxcli.errors import InputError, UsageError
 from rxcli.ingest.sniff import HEAD_BYTES, KNOWN_SUFFIXES, MAX_BYTES, Kind, check_file, check_no_list, read_bytes, sniff
 from rxcli.types import Frame
 
-__all__ = ["KNOWN_SUFFIXES", "MAX_BYTES", "open_source"]
+__all__ = ["KNOWN_SUFFIXES", "MAX_BYTES", "begun", "open_source"]
 
 
 def open_source(path: str | Path) -> Iterator[Frame]:
@@ -33,6 +35,33 @@ def open_source(path: str | Path) -> Iterator[Frame]:
         known = "JPEG, PNG, TIFF, HEIC, camera RAW, MP4, MOV, MKV or AVI"
         raise InputError(f"{path}: neither a picture nor a clip", f"{known} can be read")
     yield from _read(path, kind)
+
+
+def begun(path: str) -> Callable[[str], Iterator[Frame]]:
+    """`open_source`, which has begun to read one photograph in a thread."""
+    frames, found = open_source(path), list[Frame | Exception]()
+
+    def read() -> None:
+        try:
+            found.extend(islice(frames, 1))
+        except Exception as error:  # raised again where the frame is taken
+            found.append(error)
+
+    thread = Thread(target=read, daemon=True)
+    thread.start()
+
+    def opened(wanted: str) -> Iterator[Frame]:
+        thread.join()
+        if wanted != path or not found:
+            yield from open_source(wanted)
+            return
+        frame = found.pop()
+        if isinstance(frame, Exception):
+            raise frame
+        yield frame
+        yield from frames
+
+    return opened
 
 
 def _kind(path: Path) -> Kind | None:

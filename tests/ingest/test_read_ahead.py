@@ -8,6 +8,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from rxcli import ingest
 from rxcli.errors import InputError
 from rxcli.ingest import ahead
 from rxcli.types import Frame
@@ -57,3 +58,22 @@ def test_leaving_early_closes_the_source() -> None:
         assert next(source).index == 0
     assert log[-1] == -1
     assert is_over()
+
+
+def test_a_photo_that_was_begun_is_read_once_and_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+
+    def opened(path: str) -> Generator[Frame, None, None]:
+        read.append(threading.current_thread().name)
+        if path == "cut.jpg":
+            raise InputError("cut.jpg: cut", "copy it again")
+        yield from frames(1)
+
+    monkeypatch.setattr(ingest, "open_source", opened)
+    photo = ingest.begun("a.jpg")
+    for path, n_read in (("a.jpg", 1), ("b.jpg", 2), ("a.jpg", 3)):
+        assert [frame.index for frame in photo(path)] == [0]
+        assert len(read) == n_read
+    assert read[0] != threading.current_thread().name == read[1]
+    with pytest.raises(InputError, match="cut"):
+        list(ingest.begun("cut.jpg")("cut.jpg"))
