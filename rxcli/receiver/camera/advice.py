@@ -43,14 +43,12 @@ def why_not(strips: ColumnStrips) -> str:
 
 def stripe_likeness(strips: ColumnStrips) -> tuple[FloatArray, BoolArray]:
     """Correlation of neighbouring strips in bands of rows, 0..1; and whether a band is lit."""
-    level, weight = levelled(strips.light, strips.inside, SETTINGS.likeness_rows)
+    level = levelled(strips.light, strips.inside, SETTINGS.likeness_rows)
     blocks = np.linspace(0, strips.rows.size, SETTINGS.likeness_bands + 1).astype(int)[:-1]
 
     def summed(values: Float32Array) -> FloatArray:
         return np.asarray(np.add.reduceat(values, blocks, axis=1), np.float64)
 
-    # Strips without light are not used.
-    level = level * weight
     product = summed(level[:-1] * level[1:]).sum(axis=0)
     power = np.sqrt(summed(level[:-1] ** 2).sum(axis=0) * summed(level[1:] ** 2).sum(axis=0))
     lit = summed(strips.light).max(axis=0) > 0.02 * strips.rows.size / SETTINGS.likeness_bands

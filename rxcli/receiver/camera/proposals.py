@@ -62,15 +62,11 @@ def propose(
         exposure_s: exposure, None where the file does not state it.
         may_bend: whether the camera may have taken a distortion out, as it cannot from a mosaic.
     """
-    width = stripe_rows(strips)
+    coarse, level, width = _coarse(strips)
     if width <= 0:
         return []
     rates = {screen.packet_slots: screen.slot_rate_hz for screen in reversed(screens)}
     exposures = {length: (exposure_s or 0.0) * rate for length, rate in rates.items()}
-    coarse = joined(strips, max(1, int(width / SETTINGS.rows_per_width)))
-    window = round(SETTINGS.level_widths * width / coarse.pitch)
-    level, weight = levelled(coarse.light, coarse.inside, window)
-    level *= weight
     bends = [np.zeros(4)] + ([likeliest_bend(coarse, level)] if may_bend else [])
     found = [clock for curvature in bends for clock in _clocks(coarse, level, curvature, width, exposures)]
     is_short = exposure_s is not None and max(exposures.values()) <= LONG_EXPOSURE_SLOTS
@@ -90,12 +86,9 @@ def propose_slots(strips: ColumnStrips, *, may_bend: bool = True) -> list[Camera
         strips: of the picture as it is stored.
         may_bend: whether the camera may have taken a distortion out, as it cannot from a mosaic.
     """
-    width = stripe_rows(strips)
+    coarse, level, width = _coarse(strips)
     if width <= 0:
         return []
-    coarse = joined(strips, max(1, int(width / SETTINGS.rows_per_width)))
-    level, weight = levelled(coarse.light, coarse.inside, round(SETTINGS.level_widths * width / coarse.pitch))
-    level *= weight
     n_bends = SETTINGS.n_line_bends if may_bend else 1
     bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, n_bends) if may_bend else np.zeros(1)
     curvatures = bends[:, None] * UNIT_BEND
@@ -119,6 +112,13 @@ def propose_slots(strips: ColumnStrips, *, may_bend: bool = True) -> list[Camera
         for rows, strength in (found[place],)
         for is_reversed in (False, True)
     ]
+
+
+def _coarse(strips: ColumnStrips) -> tuple[ColumnStrips, Float32Array, float]:
+    """The strips on rows that are as few as their stripes allow, their levelled light, and the stripes' half width."""
+    width = stripe_rows(strips)
+    coarse = joined(strips, max(1, int(width / SETTINGS.rows_per_width)))
+    return coarse, levelled(coarse.light, coarse.inside, round(SETTINGS.level_widths * width / coarse.pitch)), width
 
 
 def _strongest_line(
@@ -155,9 +155,7 @@ def stripe_rows(strips: ColumnStrips) -> float:
     """
     width = float(SETTINGS.first_width_rows)
     for _ in range(SETTINGS.width_rounds):
-        window = round(SETTINGS.level_widths * width)
-        level, weight = levelled(strips.light, strips.inside, window)
-        level *= weight
+        level = levelled(strips.light, strips.inside, round(SETTINGS.level_widths * width))
         width = _half_width(_autocorrelation(level[:-1:2], level[1::2]))
         if width <= 0:
             break

@@ -84,8 +84,8 @@ def joined(strips: ColumnStrips, n: int) -> ColumnStrips:
     )
 
 
-def levelled(light: Float32Array, inside: Float32Array, window: int) -> tuple[Float32Array, Float32Array]:
-    """Light (M, R) against mean and spread of the `window` rows around it; and the weight behind it, 0..1.
+def levelled(light: Float32Array, inside: Float32Array, window: int) -> Float32Array:
+    """Light (M, R) against mean and spread of the `window` rows around it, times the columns' share of it.
 
     What a strip has in common with a neighbour is the columns' light; the rest is noise and picture.
     """
@@ -101,7 +101,7 @@ def levelled(light: Float32Array, inside: Float32Array, window: int) -> tuple[Fl
     sigmas = np.float32(SETTINGS.bounded_sigmas)
     doubt = signal + sigmas * sigmas * (power - signal) + np.float32(SETTINGS.min_variance)
     level = np.clip(change / np.sqrt(doubt), -sigmas, sigmas)
-    return level, signal / doubt * inside
+    return np.asarray(level * (signal / doubt * inside), np.float32)
 
 
 def columns_of(level: Float32Array, n_columns: int) -> Float32Array:
