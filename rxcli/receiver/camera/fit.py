@@ -137,7 +137,7 @@ class _Model:
         at = int(np.clip(misfit.argmin(), 1, tried.size - 2))
         curve, slope, _ = np.polyfit(tried[at - 1 : at + 2], misfit[at - 1 : at + 2], 2)
         if curve <= 0:
-            return float(tried[misfit.argmin()]), 0.3 * exposure_slots
+            return float(tried[misfit.argmin()]), exposure_slots / 2
         n_slots = self.strips.n_columns * float(np.ptp(self.strips.rows)) / values[1]
         return float(np.clip(-slope / (2 * curve), tried[0], tried[-1])), float(np.sqrt(1 / (curve * n_slots)))
 

@@ -18,11 +18,11 @@ from rxcli.receiver.screen.grid import Grid, grid_through
 from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import Float32Array, FloatArray
 
-#: Columns across the picture, or across a fifth of it, and their step; minimum number of strips per column.
-_MIN_PITCH, _MAX_PITCH, _PITCH_STEP, _MIN_COLUMN_STRIPS = 9.0, 46.0, 0.4, 4.0
+#: Columns across the picture, or across a fifth of it; minimum number of strips per column.
+_MIN_PITCH, _MAX_PITCH, _MIN_COLUMN_STRIPS = 9.0, 46.0, 4.0
 #: Maximum turn and maximum changes of pitch across and along the columns, as shares of the pitch; step of all three at
-#: a corner of the picture, columns.
-_MAX_TURN, _MAX_ACROSS, _MAX_ALONG, _CORNER_STEP = 0.12, 0.2, 0.3, 0.4
+#: a corner of the picture, and of the columns across it, columns.
+_MAX_TURN, _MAX_ACROSS, _MAX_ALONG, _STEP = 0.12, 0.2, 0.3, 0.4
 #: Distance of the pairs of strips that show the comb of borders best, columns.
 _PAIR_DISTANCE = 0.72
 #: Combs that are tried as grids, and minimum height of a comb, standard deviations by chance.
@@ -78,7 +78,7 @@ def _all_combs(strips: PictureStrips) -> list[Comb]:
     """The best comb of each pitch."""
     step = strips.step * strips.n_parts
     max_pitch = min(_MAX_PITCH, 1 / (_MIN_COLUMN_STRIPS * step))
-    pitches = np.arange(_MIN_PITCH, max_pitch, _PITCH_STEP)
+    pitches = np.arange(_MIN_PITCH, max_pitch, _STEP)
     distances = np.maximum(np.round(_PAIR_DISTANCE / (pitches * step)), 1).astype(np.int64)
     y = strips.raw_y.mean(axis=1) * strips.n_parts
     found: list[Comb] = []
@@ -98,19 +98,19 @@ def _all_combs(strips: PictureStrips) -> list[Comb]:
 
 def _range(largest: float, at_corner: float) -> FloatArray:
     """Values from `-largest` to `largest`, including 0, in steps that move a corner by the corner's step at most."""
-    n = int(np.ceil(largest * at_corner / _CORNER_STEP))
+    n = int(np.ceil(largest * at_corner / _STEP))
     return np.linspace(-largest, largest, 2 * n + 1)
 
 
 def _best_combs(rest: Float32Array, step: float, y: FloatArray, pitches: FloatArray, n_parts: int) -> list[Comb]:
     """The best comb of each pitch, from values (W, n) of pairs of strips: sum along the strips, then over windows."""
     largest, half_x, half_y = float(pitches[-1]), 0.5, float(np.abs(y).max())
-    if _MAX_TURN * largest * (y[1] - y[0]) < _CORNER_STEP and len(y) % 2 == 0:
+    if _MAX_TURN * largest * (y[1] - y[0]) < _STEP and len(y) % 2 == 0:
         rest, y = rest[::2] + rest[1::2], (y[::2] + y[1::2]) / 2
     turns = _range(_MAX_TURN, largest * half_y)
     across = _range(_MAX_ACROSS / n_parts, largest * half_x**2)
     along = _range(_MAX_ALONG / n_parts, largest * half_x * half_y)
-    spacing, reach = _PITCH_STEP / 2, float(along.max()) * half_y * largest
+    spacing, reach = _STEP / 2, float(along.max()) * half_y * largest
     start = int(np.floor((float(pitches[0]) - reach) / spacing))
     n_frequencies = int(np.ceil((largest + reach) / spacing)) - start + 1
     own = pitches[:, None, None] * (1 + along[:, None] * y)
@@ -134,7 +134,7 @@ def _best_combs(rest: Float32Array, step: float, y: FloatArray, pitches: FloatAr
 def _waves(n: int, step: float, start: int, n_frequencies: int) -> NDArray[np.complex64]:
     """(n, F) complex waves at pairs of strips with spacing `step`, from the frequency with index `start` on."""
     x = (np.arange(n) - (n - 1) / 2) * step
-    return _turned(np.outer(x, (start + np.arange(n_frequencies)) * (_PITCH_STEP / 2)))
+    return _turned(np.outer(x, (start + np.arange(n_frequencies)) * (_STEP / 2)))
 
 
 def _turned(turns: FloatArray) -> NDArray[np.complex64]:

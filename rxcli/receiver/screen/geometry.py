@@ -27,7 +27,7 @@ _N_POINTS = 65
 _LARGEST_MOVE = 10.0
 #: Maximum steps of the inverse of a lens, which reach 1e-6 px for ordinary lenses; it has converged when a step moves
 #: every point by less than this many pixels.
-_INVERSE_STEPS, _MIN_STEP = 20, 1e-8
+INVERSE_STEPS, _MIN_STEP = 20, 1e-8
 #: Rows over which edges are interpolated linearly: straight to a thousandth of a pixel.
 _KNOT_ROWS = 32
 
@@ -93,7 +93,7 @@ def undistort(points: FloatArray, lens: Lens | None) -> FloatArray:
         return points
     reach = _LARGEST_MOVE * np.abs(lens.camera_matrix[0, 0])
     found = points.copy()
-    for _ in range(_INVERSE_STEPS):
+    for _ in range(INVERSE_STEPS):
         step = found + points - distort(found, lens)
         before, found = found, np.where((np.abs(step - points) <= reach).all(axis=-1, keepdims=True), step, points)
         if np.abs(found - before).max(initial=0.0) < _MIN_STEP:

@@ -17,7 +17,6 @@ from rxcli.types import FloatArray, Lens
 
 #: Prior standard deviations of perspective and of radial distortion.
 _PERSPECTIVE_SD, _RADIAL_SD = 0.15, 0.004
-_INVERSE_STEPS = 12
 #: Gauss-Newton steps to a grid through given columns; their spacing, as they lie on a smooth surface; their precision,
 #: columns to the power of minus two.
 _STEPS, _EVERY, _PRECISION = 4, 8, 100.0
@@ -64,7 +63,7 @@ class Grid:
     def pixels_of(self, flat: FloatArray) -> FloatArray:
         """(n, 2) pixels of (n, 2) offsets, the inverse of `flat`."""
         distorted = flat
-        for _ in range(_INVERSE_STEPS):
+        for _ in range(geometry.INVERSE_STEPS):
             distorted = flat / (1 + self.coefficients[-1] * (distorted**2).sum(axis=-1, keepdims=True))
         pixels = distorted * self.width + np.array([(self.width - 1) / 2, (self.height - 1) / 2])
         return geometry.distort(pixels, geometry.bending(self.lens))

@@ -21,16 +21,16 @@ from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Parts of a column in which light is measured; parts on either side of a border whose levels are compared.
 _PARTS, _BESIDE = 8, 3
-#: Significance from which light is the columns'; percentile of the brightest parts, and e-folds below them at which a
-#: part is black; share of the most lit rows' light from which rows count.
-_SURE, _BRIGHT, _BLACK, _LIT_ROWS = 4.0, 90, 4.0, 0.2
+#: Standard deviations from which light is the columns', and the means beside a border differ; e-folds below the
+#: brightest parts at which a part is black; share of the most lit rows' light from which rows count.
+_SURE, _BLACK, _LIT_ROWS = 4.0, 4.0, 0.2
 #: Light of one grey level of 255; maximum log-odds by which a part that never goes out is no column.
 _GREY_LEVEL, _MAX_STEADY = 255.0**-2, 2.0
 #: Mean light of parts that belong to the light; columns of the picture that must lie beyond light which ends in it.
 _ENDS, _IN_VIEW = 0.15, 0.3
-#: Parts are faint up to this share of the way from the darkest to the brightest (percentile), of the root of light;
-#: standard deviations of a plain difference between the means beside a border, and their minimum, of white.
-_DARK, _FAINT, _PLAIN_EDGE, _MIN_FAINT_SD = 10, 0.05, 4.0, 0.0004
+#: Share of the parts that are the darkest, or the brightest; parts are faint up to a share of the way from these to
+#: those, of the root of light; minimum standard deviation of it, of white.
+_DARK, _FAINT, _MIN_FAINT_SD = 0.1, 0.05, 0.0004
 #: Standard deviation of the sides of a bright part against the screen's, screen widths.
 _SIDE_SD = 0.0125
 #: Distances from the screen's middle, screen widths, within which edges lie that it has in pairs: of films and of the
@@ -143,7 +143,7 @@ def light_profile(
     is_faint, faint = _faint_light(total(lit * np.sqrt(np.maximum(strips.level, 0))) / n_lit, shown)
     level = np.log(total(lit * strips.level) / n_lit + _GREY_LEVEL)
     darkest = total(lit * np.log(strips.darkest + _GREY_LEVEL)) / n_lit
-    level = np.clip(1 + (level - np.percentile(level[shown], _BRIGHT)) / _BLACK, 0, 1) * shown
+    level = np.clip(1 + (level - np.quantile(level[shown], 1 - _DARK)) / _BLACK, 0, 1) * shown
     of_columns = darkest[shown & (coherent > 0.5)]
     usual = np.median(of_columns) if of_columns.size else np.inf
     steady = np.clip(darkest - usual, 0, _MAX_STEADY) * (1 - coherent) * shown
@@ -159,12 +159,12 @@ def _faint_light(root: FloatArray, shown: BoolArray) -> tuple[BoolArray, FloatAr
 
     The screen's frame, and the room around it, mostly differ from that. Neighbouring parts give the noise.
     """
-    darkest, brightest = np.percentile(root[shown], (_DARK, 100 - _DARK / 2))
+    darkest, brightest = np.quantile(root[shown], (_DARK, 1 - _DARK / 2))
     is_faint = shown & (root < darkest + _FAINT * (brightest - darkest))
     beside = np.abs(np.diff(root))[is_faint[1:] & is_faint[:-1]]
     # Of normal differences the median is 0.95 standard deviations of one part.
     sd = max(float(np.median(beside)) / 0.95 if beside.size else np.inf, _MIN_FAINT_SD)
-    plain = _PLAIN_EDGE * sd * np.sqrt(2 * _BESIDE)
+    plain = _SURE * sd * np.sqrt(2 * _BESIDE)
     return is_faint, np.where(is_faint, root, 0) / plain
 
 

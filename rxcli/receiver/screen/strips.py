@@ -33,7 +33,7 @@ _GAP_LIGHT, _MIN_GAP_WIDTHS, _MIN_APART, _MIN_APART_LIGHT = 0.25, 0.015, 0.2, 0.
 #: Averaged rows whose mean the band pass takes off.
 LONG_ROWS = 8
 #: Share of a strip's power that may be due to rounding.
-_ROUNDING = 1e-6
+ROUNDING = np.float32(1e-6)
 #: Arrays by block and strip.
 _OF_STRIPS = ("changes", "coherence", "level", "darkest", "raw_x", "raw_y", "x", "y")
 
@@ -94,7 +94,7 @@ class PictureStrips:
         """The same without the light that all columns share, as of headers and lamps: it shows no borders."""
         changes = _without(self.changes, np.einsum("bsr,bs->br", self.changes, self.coherence))
         left = _power(changes)
-        changes /= np.sqrt(left + np.float32(_ROUNDING))[..., None]
+        changes /= np.sqrt(left + ROUNDING)[..., None]
         lit = _lit(changes) * left
         return replace(self, changes=changes, coherence=lit, n_rows=_independent_rows(changes, lit))
 
@@ -219,7 +219,7 @@ def _short_rows(light: Float32Array) -> int:
     max_rows, every = _MAX_SHORT_ROWS, max(len(light) // _SAMPLED_STRIPS, 2)
     n = len(light) // every
     left, right = (light[start::every][:n] for start in (0, 1))
-    left, right = (part - cv2.blur(part, (8 * max_rows + 1, 1)) for part in (left, right))
+    left, right = (part - cv2.blur(part, (LONG_ROWS * max_rows + 1, 1)) for part in (left, right))
     n_lags = 2 * max_rows
     correlation = [float(np.einsum("sr,sr->", left[:, :-lag], right[:, lag:])) for lag in range(1, n_lags)]
     # White row noise does not contribute at lags from 1 on.

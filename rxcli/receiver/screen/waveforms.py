@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_slopes, grid_step
-from rxcli.receiver.screen.strips import PictureStrips
+from rxcli.receiver.screen.strips import ROUNDING, PictureStrips
 from rxcli.types import BoolArray, Float32Array, FloatArray
 
 #: Ridge regularisation of the waveforms of faint columns, in strips.
@@ -22,7 +22,6 @@ _RIDGE = 0.5
 _STEP_GAIN = 2.5
 #: Maximum number of columns of a block: on a plane viewed nearly edge-on the grid counts any number.
 _MAX_COLUMNS = 64
-_TINY = np.float32(1e-6)
 #: Logarithm of the minimum share of a column: products of smaller numbers take many times the time.
 _MIN_SHARE = np.float32(-30)
 
@@ -52,7 +51,7 @@ class Mixes:
             number = first_column + np.arange(n)
             share *= ((number >= 0) & (number < n_columns))[:, None]
             share *= ((u > -first_column) & (u < n_columns - first_column))[..., None]
-        share /= np.sqrt(_dot(share, share) + _TINY**2)[..., None]
+        share /= np.sqrt(_dot(share, share) + ROUNDING**2)[..., None]
         return cls(share, distance, first_column, sigma)
 
     def slopes(self) -> Float32Array:
@@ -111,7 +110,7 @@ def explained_light(strips: PictureStrips, u: FloatArray, sigma: float) -> float
     total, mixes = 0.0, Mixes.of(u, sigma)
     for half, waves in _halves(strips, mixes):
         predicted, own = _Predicted.of(waves, strips.changes[:, half]), mixes.share[:, half]
-        power = _dot(np.matmul(own, predicted.waves), own) * predicted.power + _TINY
+        power = _dot(np.matmul(own, predicted.waves), own) * predicted.power + ROUNDING
         similarity = np.maximum(_dot(own, predicted.strips), 0) ** 2 / power
         total -= 0.5 * strips.n_rows * float(np.log1p(-np.minimum(similarity, np.float32(0.999))).sum())
     return total
@@ -177,12 +176,12 @@ def offsets(
     """
     predicted = _Predicted.of(waves, changes)
     model = np.matmul(share, predicted.waves)
-    power = _dot(model, share) + _TINY
+    power = _dot(model, share) + ROUNDING
     gain = _dot(predicted.strips, share) / power
     shared = _dot(model, slope) / power
-    slope_power = np.maximum(_dot(np.matmul(slope, predicted.waves), slope) - shared * shared * power, _TINY)
+    slope_power = np.maximum(_dot(np.matmul(slope, predicted.waves), slope) - shared * shared * power, ROUNDING)
     projection = _dot(predicted.strips, slope) - shared * gain * power
-    noise = np.maximum(predicted.power - gain * gain * power, 0) / np.float32(n_rows) + _TINY
+    noise = np.maximum(predicted.power - gain * gain * power, 0) / np.float32(n_rows) + ROUNDING
     lit = np.maximum(gain, np.float32(0))
     off, precision = projection / (np.maximum(lit, np.float32(0.05)) * slope_power), lit * lit * slope_power / noise
     # Huber weights: offsets beyond one standard deviation count less.

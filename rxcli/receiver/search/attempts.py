@@ -25,7 +25,7 @@ _AS_STORED = (
     "from its left"
 )
 #: Relative difference of line delays up to which an estimate agrees with a profile, and confidence of a sure packet.
-_SAME_LINE_DELAY, _SURE = 0.01, 0.9
+_SAME_LINE_DELAY, _SURE = 0.01, SETTINGS.sure_certainty
 #: Packets of a long exposure that show that it was stated rightly.
 _PLAIN_LONG = 4
 #: Receives a photograph as it is, if a screen has evidence of packets of more than a least.

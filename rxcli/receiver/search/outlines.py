@@ -25,9 +25,8 @@ from rxcli.types import FloatArray, Frame
 _TOO_SLOW = (
     "the screen may have no profile here (vlc-rx profiles lists them); else use a faster slot rate or shorter packets"
 )
-#: Log-odds of the bright part of a picture against columns that were found; probability that it, or the part with
-#: stripes, is the whole screen, if it shows packets.
-_BRIGHT_LOG_ODDS, _BRIGHT_CERTAINTY = -50.0, 0.9
+#: Log-odds of the bright part of a picture against columns that were found.
+_BRIGHT_LOG_ODDS = -50.0
 #: Natural logarithm of the ratio of aspects up to which a bright part may be the screen, and its probability beyond: of
 #: 39 bright parts of dark pictures none had the screen's aspect, and films alone, one in three, its width.
 _SAME_ASPECT, _FILM_CERTAINTY = 0.08, 0.3
@@ -70,7 +69,7 @@ def without_borders(cache: FrameCache) -> list[Outline]:
     if striped is None:
         return []
     own = Outline(
-        striped, _BRIGHT_CERTAINTY, column_offset=None, log_odds=_BRIGHT_LOG_ODDS, family=-2, stands_out=False
+        striped, SETTINGS.sure_certainty, column_offset=None, log_odds=_BRIGHT_LOG_ODDS, family=-2, stands_out=False
     )
     outlines = [own] if bright is None else [replace(own, corners=bright, log_odds=0.0, family=-1), own]
     return [_viewed(outline, frame) for outline in outlines]
@@ -121,7 +120,7 @@ def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
     outlines = [[viewed(outline) for outline in screen] for screen in screens]
     if len(outlines) == 1 and bright is not None:
         # The picture on the screen may show borders that are none of the columns'.
-        certainty = _BRIGHT_CERTAINTY if _may_be_screen(bright, layouts) else _FILM_CERTAINTY
+        certainty = SETTINGS.sure_certainty if _may_be_screen(bright, layouts) else _FILM_CERTAINTY
         own = viewed(Outline(bright, certainty, log_odds=_BRIGHT_LOG_ODDS, family=-1))
         tolerance = SETTINGS.same_sides * np.ptp(bright[:, 0])
         if all(np.abs(outline.corners - own.corners).max() >= tolerance for outline in outlines[0]):

@@ -153,7 +153,7 @@ def likeliest_of_family(outlines: Sequence[Outline]) -> Outline:
     best = max(outlines, key=lambda outline: (outline.log_odds, -_left(outline)))
     share = 1 / float(np.exp(odds - odds.max()).sum())
     if best.fills and share < SETTINGS.likely_certainty:
-        possible = (outline for outline in outlines if outline.log_odds > best.log_odds - SETTINGS.may_be_log_odds)
+        possible = (outline for outline in outlines if outline.log_odds > best.log_odds - SETTINGS.reach)
         return max(possible, key=_left)
     return best
 

@@ -246,7 +246,7 @@ class _Walk:
         best, acquisition = self._best(), _acquired(hypothesis)
         # Without packets an estimated camera is rejected, and joint detection takes long.
         is_costly = hypothesis.camera.hypothesis is not None and acquisition.clock.exposure_slots > LONG_EXPOSURE_SLOTS
-        if is_costly and self._n_in_vain >= SETTINGS.hopeless_long_budget:
+        if is_costly and self._n_in_vain >= SETTINGS.doubtful_budget:
             return
         if (best is not None or is_costly) and hypothesis.screen.columns > SETTINGS.few_columns:
             half = self._measured(hypothesis, acquisition.of_columns(acquisition.middle_columns))

@@ -17,16 +17,16 @@ class SearchSettings(msgspec.Struct, frozen=True):
     #: Below this evidence an estimated camera is rejected; above the second no other one is proposed.
     few_packets: float = 40.0
     plain_estimate: float = 100.0
-    #: Maximum number of initial passes of a frame; if its columns do not stand out, if it shows no borders of columns,
-    #: and without any evidence: of all hypotheses, and of unknown cameras' long exposures, which take long.
+    #: Maximum number of initial passes of a frame; if its columns do not stand out, and of unknown cameras' long
+    #: exposures, which take long, without evidence; if it shows no borders of columns; of all without evidence.
     budget: int = 24
     doubtful_budget: int = 3
     borderless_budget: int = 12
     hopeless_budget: int = 8
-    hopeless_long_budget: int = 3
     #: Evidence of a screen without borders, times that of doubtful columns, from which it is taken instead.
     borderless_gain: float = 2.0
-    #: Siblings of a scored hypothesis get a pass if their score could come this near to the best one.
+    #: Siblings of a scored hypothesis get a pass if their score could come this near to the best one; log-odds within
+    #: which an outline is possible.
     reach: float = 3.0
     #: Number of columns up to which all are measured at once, not the middle half first.
     few_columns: int = 8
@@ -36,11 +36,10 @@ class SearchSettings(msgspec.Struct, frozen=True):
     min_lead: float = 1.6
     #: Log prior lost by each further camera.
     next_camera: float = 0.5
-    #: Probability from which a column's number is likely, and from which it is reported as the screen's; log-odds
-    #: within which an outline is possible.
+    #: Probability from which a column's number is likely; and from which it is reported as the screen's, that of a
+    #: bright part of the picture to be the whole screen, and from which a packet is sure.
     likely_certainty: float = 0.5
     sure_certainty: float = 0.9
-    may_be_log_odds: float = 3.0
     #: Weight of the log-likelihood of packets in outermost columns, as samples err together.
     outer_weight: float = 0.2
 
