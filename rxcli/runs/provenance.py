@@ -7,13 +7,14 @@ from typing import Any
 
 import msgspec
 
-from rxcli import receiver
+from rxcli import link, receiver
 from rxcli.resources import data_dir
 
 
 def settings_in_force() -> str:
-    """Hash of the receiver's thresholds (settings objects and named numbers) and of its fitted models."""
-    names = sorted(found.name for found in walk_packages(receiver.__path__, f"{receiver.__name__}."))
+    """Hash of the thresholds of receiver and link layer (settings, named numbers) and of fitted models."""
+    rooms = [walk_packages(room.__path__, f"{room.__name__}.") for room in (link, receiver)]
+    names = sorted(found.name for room in rooms for found in room)
     numbers = {
         f"{name}.{constant}": value
         for name in names

@@ -120,15 +120,16 @@ def test_wrong_options_end_a_run(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("screen.find._PARTS", 6),
-        ("search.settings.SETTINGS", msgspec.structs.replace(SETTINGS, plain=399.0)),
-        ("light._MAX_MEMORY", 4),
+        ("receiver.screen.find._PARTS", 6),
+        ("receiver.search.settings.SETTINGS", msgspec.structs.replace(SETTINGS, plain=399.0)),
+        ("receiver.light._MAX_MEMORY", 4),
+        ("link.beacons._TRY_UP_TO", 0.1),
     ],
 )
 def test_a_changed_threshold_shows_in_the_provenance(name: str, value: object, monkeypatch: pytest.MonkeyPatch) -> None:
     before = settings_in_force()
     assert before == settings_in_force()
-    monkeypatch.setattr(f"rxcli.receiver.{name}", value)
+    monkeypatch.setattr(f"rxcli.{name}", value)
     assert settings_in_force() != before
 
 

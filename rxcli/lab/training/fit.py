@@ -214,7 +214,7 @@ class _Checkpoint:
 
     @property
     def _key(self) -> str:
-        """What a stored state must be of, to be restored."""
+        """Recipe and amount of data; a stored state of another key is not restored."""
         return f"{self.recipe} {self.n_samples} samples"
 
     def save(self, history: list[tuple[int, float, float]]) -> None:
