@@ -28,7 +28,7 @@ from rxcli.link.encoder import (
     visible_bits_of_burst,
 )
 from rxcli.link.slots import WITHOUT_TEXT, WRITERS, bytes_per_row, order_of, write_slots
-from rxcli.outputs import ENCODED, TRUTH, Output, claim, write_whole
+from rxcli.outputs import ENCODED, TRUTH, Output, claim, unwritable, write_whole
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import payload_bits
 from rxcli.results.report import plural
@@ -92,8 +92,10 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
             plan.write_csv(out) if suffix == ".csv" else plan.write_labels(out)
         if options["truth"]:
             write_whole(options["truth"], json.dumps(plan.truth(), indent=1) + "\n")
+    except BrokenPipeError:
+        raise
     except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror or error})", "name another file") from None
+        raise unwritable(out, error) from None
     click.echo(f"{out}: {plan.summary()}", err=True)
 
 

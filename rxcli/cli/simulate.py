@@ -93,8 +93,7 @@ def simulate(out: Path, **options: Any) -> None:
         truth = _write(capture, out, file_format, options["bit_rate"])
         _write_extras(capture, options)
     except OSError as error:
-        where = error.filename or out
-        raise UsageError(f"{where}: cannot be written ({error.strerror or error})", "choose another place") from None
+        raise outputs.unwritable(error.filename or out, error) from None
     click.echo(f"{out} and {truth.name}: {_summary(capture)}", err=True)
 
 

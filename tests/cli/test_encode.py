@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import COMMAND, ENVIRONMENT
 from numpy.typing import NDArray
 
 from rxcli.cli.main import run
@@ -250,3 +251,12 @@ def test_it_is_said_that_no_packet_fits_a_frame(tmp_path: Path, capsys: pytest.C
     arguments = ["--preset", "video-1080p", "--screen", "paper-8k65", "--fill", "0.2", "--scale", "0.1"]
     assert run(["simulate", str(tmp_path / "x.png"), *arguments]) == ExitCode.OK
     assert "no packet fits a frame" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("where", "code", "said"), [("| head -c 1", 130, ""), ("> /dev/full", 3, "No space left")])
+def test_a_stream_that_takes_no_more(where: str, code: int, said: str) -> None:
+    command = f"set -o pipefail; {' '.join(COMMAND)} encode --payload counter --seconds 20 --out - {where}"
+    done = subprocess.run(["bash", "-c", command], env=ENVIRONMENT, capture_output=True, text=True, check=False)
+    assert done.returncode == code
+    assert said in done.stderr
+    assert ("cannot be written" in done.stderr) == bool(said)
