@@ -8,7 +8,7 @@ similarity of neighbouring columns; `fit` estimates it from the decoded slots.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 
@@ -147,6 +147,7 @@ def _distinct(found: Iterable[CameraHypothesis]) -> list[CameraHypothesis]:
     return out
 
 
+@lru_cache(maxsize=4)  # The reason why a picture shows no clock asks again.
 def stripe_rows(strips: ColumnStrips) -> float:
     """Rows of the lag at which strips are half as like the one beside as a row later; 0 where there are no stripes.
 

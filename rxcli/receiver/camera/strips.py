@@ -11,7 +11,7 @@ from rxcli.receiver.light import NoiseModel
 from rxcli.types import Float32Array, FloatArray, RowProfiles
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ColumnStrips:
     """Light of M strips on R rows; the strips of a column lie side by side."""
 

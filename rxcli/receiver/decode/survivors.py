@@ -368,7 +368,7 @@ def _backward(steps: list[_Step], ends: list[tuple[int, _Paths]], after: FloatAr
             paths = pending.pop()[1]
             out.append(_posterior(paths, after))
         step = steps[n]
-        gain = step.gain + np.take_along_axis(after, np.maximum(step.target, 0), 1)
+        gain = step.gain + after.take(np.maximum(step.target, 0) + after.shape[1] * np.arange(len(after))[:, None])
         gain[step.target < 0] = _NEVER
         top = gain.max(axis=1, keepdims=True)
         total = np.add.reduceat(np.exp(gain - top), step.starts, axis=1)
