@@ -123,7 +123,7 @@ def _receive_screen(
     """Receive one screen with more than `least` evidence; `nothing` is the result without any."""
     frame, timer = cache.frame, cache.timer
     # Search: where the columns are, what a row is in time, which screen and clock.
-    found = search(cache, options, outlines=outlines)
+    found = search(cache, options, outlines=outlines, least=least)
     if isinstance(found, Failure):
         return Received(failed(nothing, found), {})
     if found.best.evidence <= least:

@@ -14,7 +14,13 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.screen.outline import Outline
-from rxcli.receiver.search.cameras import has_stated_readout, known_camera, propose_cameras, relabelled_camera
+from rxcli.receiver.search.cameras import (
+    estimated_camera,
+    has_stated_readout,
+    known_camera,
+    propose_cameras,
+    relabelled_camera,
+)
 from rxcli.receiver.search.evidence import USUAL_COLUMNS
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.settings import SETTINGS
@@ -137,6 +143,11 @@ class Proposer:
             if same_clock and candidate.family != outline.family:
                 change = SETTINGS.temper * (candidate.log_odds - outline.log_odds)
                 yield self._hypothesis(candidate, camera, nearest_screen(same_clock, n_columns), log_prior + change)
+        if camera.hypothesis is not None and scored.reception.is_long:
+            # What long exposures leave of a packet fits either way to some extent.
+            other_way = replace(camera.hypothesis, reversed=not camera.reversed, number=-1 - camera.hypothesis.number)
+            back = estimated_camera(other_way, hypothesis.screen.slot_rate_hz, self.cache.frame)
+            yield self._hypothesis(outline, back, hypothesis.screen, log_prior)
         by_clock = _by_clock(outline, camera, self.options.screens)
         by_columns = {screen.columns: screen for screen in reversed(by_clock.pop(clock, []))}
         for columns, screen in by_columns.items():

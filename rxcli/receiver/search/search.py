@@ -43,6 +43,7 @@ def search(
     outlines: list[Outline] | None = None,
     budget: int = SETTINGS.budget,
     may_bend: bool = True,
+    least: float = 0.0,
 ) -> Found | Failure:
     """Find outline, rows, camera, screen, clock and bursts of a frame.
 
@@ -53,25 +54,26 @@ def search(
         outlines: of the screen to receive; those of the clearest one in the picture if left out.
         budget: maximum number of initial passes.
         may_bend: whether an unknown camera may have taken a distortion out, so that stripes are bent.
+        least: evidence that a better hypothesis has to exceed.
     """
     if outlines is None:
         screens = proposed_screens(cache, options)
         if isinstance(screens, Failure):
             return screens
         outlines = screens[0]
-    found = _search(cache, options, known, outlines, budget, may_bend)
+    found = _search(cache, options, known, outlines, budget, may_bend, least)
     packets = _packet_evidence(found)
     if outlines[0].family < 0 or (packets and outlines[0].stands_out):
         return found
     without = without_borders(cache)
     if not without:
         return found
-    borderless = _search(cache, options, known, without, budget, may_bend)
+    borderless = _search(cache, options, known, without, budget, may_bend, least)
     if options.corners is not None:
         if isinstance(borderless, Failure) or not _packet_evidence(borderless):
             return found
         # Of one column that sends alone, its own rows give the camera, and the corners its number.
-        numbered_by_corners = _search(cache, options, borderless.best.context, outlines, budget, may_bend)
+        numbered_by_corners = _search(cache, options, borderless.best.context, outlines, budget, may_bend, least)
         return numbered_by_corners if _packet_evidence(numbered_by_corners) else found
     is_steady = isinstance(borderless, Failure) and borderless.message == STEADY_LIGHT and not packets
     return borderless if is_steady or _packet_evidence(borderless) > SETTINGS.borderless_gain * packets else found
@@ -91,12 +93,13 @@ def _search(
     outlines: list[Outline],
     budget: int,
     may_bend: bool,
+    least: float,
 ) -> Found | Failure:
     """`search` among outlines."""
     proposer = Proposer(cache, options, tuple(outlines), known, may_bend)
     if not outlines[0].stands_out:
         budget = SETTINGS.borderless_budget if outlines[0].family < 0 else SETTINGS.doubtful_budget
-    walk = _Walk(proposer, budget)
+    walk = _Walk(proposer, budget, least)
     best = walk.run()
     min_evidence = (
         PASSES.min_packets_llr if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
@@ -133,8 +136,8 @@ def _corners_by_slots(outline: Outline, best: Scored) -> FloatArray:
 class _Walk:
     """One search under way."""
 
-    def __init__(self, proposer: Proposer, budget: int) -> None:
-        self._proposer, self._budget = proposer, budget
+    def __init__(self, proposer: Proposer, budget: int, least: float = 0.0) -> None:
+        self._proposer, self._budget, self._least = proposer, budget, least
         self._scored: list[Scored] = []
         self._tried: list[Tried] = []
         self._asked: set[tuple[object, ...]] = set()
@@ -175,7 +178,7 @@ class _Walk:
             camera, moved_slots = settle(
                 best.context, best.acquisition, best.reception, may_bend=self._proposer.may_bend
             )
-            if moved_slots < camera_settings.matters_slots and best.evidence > SETTINGS.plain_estimate:
+            if moved_slots < camera_settings.matters_slots:
                 return best.with_camera(camera)
             hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
             if hypothesis is None:
@@ -256,7 +259,7 @@ class _Walk:
                 is_plain = best.evidence > SETTINGS.plain
                 min_score = best.score + (lead if is_plain else -SETTINGS.reach)
                 min_evidence = min(PASSES.min_packets_llr, best.evidence)
-            if half.score < min_score or half.evidence < min_evidence:
+            if half.score < min_score or half.evidence < max(min_evidence, self._least / 2):
                 # By the middle columns alone scores are others than by all: the best one shows by how much.
                 self._tried.append(Tried(hypothesis, half.evidence, half.score - lead, "half"))
                 self._n_in_vain += is_costly and half.evidence < PASSES.min_packets_llr

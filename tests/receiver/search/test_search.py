@@ -164,9 +164,16 @@ def test_scores_by_the_middle_columns_compare_with_those_by_all() -> None:
     assert found.best.score - 10 < half.score < found.best.score
 
 
-@pytest.mark.parametrize(("exposure_slots", "first", "n_measured"), [(4.0, "middle", 3), (1.0, "all", 9)])
-def test_long_exposures_are_measured_on_their_middle_columns_first_until_three_were_in_vain(
-    exposure_slots: float, first: str, n_measured: int, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("exposure_slots", "evidence", "least", "measured"),
+    [
+        pytest.param(4.0, 1.0, 0.0, ["middle"] * 3, id="long exposures, until three were in vain"),
+        pytest.param(1.0, 1.0, 0.0, ["all", *["middle", "all"] * 4], id="short exposures"),
+        pytest.param(1.0, 100.0, 300.0, ["all", *["middle"] * 4], id="not all if more evidence is needed"),
+    ],
+)
+def test_hypotheses_are_measured_on_their_middle_columns_first(
+    exposure_slots: float, evidence: float, least: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock, own = SimpleNamespace(exposure_slots=exposure_slots), list[str]()
     middle = SimpleNamespace(part="middle")
@@ -174,16 +181,34 @@ def test_long_exposures_are_measured_on_their_middle_columns_first_until_three_w
 
     def measure(_: object, __: object, acquisition: Any) -> Any:
         own.append(acquisition.part)
-        return SimpleNamespace(score=0.0, evidence=1.0)
+        return SimpleNamespace(score=0.0, evidence=evidence, reception=None)
 
     monkeypatch.setitem(_Walk.run.__globals__, "_acquired", lambda _: acquisition)
     monkeypatch.setattr(_Walk, "_measured", measure)
     estimated: Any = SimpleNamespace(camera=SimpleNamespace(hypothesis=1), screen=SimpleNamespace(columns=20))
-    walk = _Walk(Proposer(FrameCache(Frame(np.zeros((8, 8), np.uint8), "")), ReceiverOptions(), ()), 8)
+    monkeypatch.setattr(_Walk, "_fitted", lambda _, scored: scored)
+    monkeypatch.setitem(_Walk.run.__globals__, "_in_likeliest_bursts", lambda scored: scored)
+    monkeypatch.setitem(_Walk.run.__globals__, "evidence", SimpleNamespace(middle_score=lambda _: 0.0))
+    proposer: Any = SimpleNamespace(siblings=lambda _: (), cameras=lambda: None)
+    walk = _Walk(proposer, 8, least)
     for _ in range(5):
         walk._score(estimated)
-    assert own[0] == first
-    assert len(own) == n_measured
+    assert own == measured
+
+
+@pytest.mark.parametrize("is_long", [True, False])
+def test_a_long_exposure_is_also_read_the_other_way_round(is_long: bool) -> None:
+    trial = trial_of("paper-17k3")
+    proposer = Proposer(FrameCache(trial.frame), ReceiverOptions(cameras=()), (Outline(trial.corners),))
+    own = next(proposer.cameras())[0]
+    scored: Any = SimpleNamespace(
+        hypothesis=own,
+        context=SimpleNamespace(camera=own.camera),
+        reception=SimpleNamespace(is_long=is_long),
+        evidence=500.0,
+    )
+    back = [sibling for sibling in proposer.siblings(scored) if sibling.camera.reversed != own.camera.reversed]
+    assert [sibling.identity != own.identity for sibling in back] == [True] * is_long
 
 
 def test_every_hypothesis_is_recorded_with_its_fate(tmp_path: Path) -> None:
