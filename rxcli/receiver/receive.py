@@ -13,6 +13,7 @@ from typing import Any
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
+from rxcli.receiver.camera.advice import NO_HEADERS
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
@@ -83,7 +84,8 @@ def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None
         cache = FrameCache(frame).in_blinking_colours()
         received = receive_either_way(cache, _in_total_order(options), _receive_still)
         soft = _with_cut_packets(cache, received, _in_total_order(options))
-    received = received._replace(result=replace(received.result, soft_bits=soft))
+    message = _with_part_in_view(received.result.message, soft)
+    received = received._replace(result=replace(received.result, soft_bits=soft, message=message))
     if on_taps is not None and received.taps:
         on_taps(frame.source, frame.index, received.taps)
     claims = ", ".join(frame.metadata.not_believed) if received.result.packets else ""
@@ -187,6 +189,14 @@ def _with_cut_packets(cache: FrameCache, received: Received, options: ReceiverOp
     cut = cut_packets(context, families)
     likeliest, *less_likely = (*cut, *([own] if own else ())) or (None,)
     return None if likeliest is None else replace(likeliest, alternatives=tuple(less_likely))
+
+
+def _with_part_in_view(message: str | None, soft: FrameSoftBits | None) -> str | None:
+    """The message, with the share of a packet in view as the reason where no header was found."""
+    if message is None or soft is None:
+        return message
+    share = float(soft.llr.any(axis=(0, 2, 3)).mean())
+    return message.replace(NO_HEADERS, f"less than a packet is in view: {assemble.further_pictures(share)}")
 
 
 def _of_columns(result: FrameResult, options: ReceiverOptions) -> tuple[ScreenProfile, ...]:

@@ -12,6 +12,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.receiver import receive
 from rxcli.receiver.camera import CameraHypothesis
+from rxcli.receiver.camera.advice import NO_HEADERS
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.camera import FrameCamera
@@ -58,6 +59,18 @@ def test_a_known_camera_is_not_asked_for_less_than_an_unknown_one(
     soft = receive._with_cut_packets(FrameCache(frame), received, ReceiverOptions(soft_bits=True))
     assert soft.llr is shown.llr
     assert soft.alternatives == (own,)
+
+
+def test_the_message_names_the_share_of_a_packet_in_view() -> None:
+    """Four of eleven symbols: three photographs, of which one is there, may show all."""
+    llr = np.zeros((2, 11, 20, 7), np.float32)
+    llr[0, :3, 5], llr[1, 2:4, 6] = 3.0, -2.0
+    soft = FrameSoftBits(np.arange(2), llr)
+    message = receive._with_part_in_view(f"a note; {NO_HEADERS}", soft)
+    assert message == (
+        "a note; less than a packet is in view: a picture shows 36 % of a packet: send 3 more photos, or film"
+    )
+    assert receive._with_part_in_view(NO_HEADERS, None) == NO_HEADERS
 
 
 def seen(monkeypatch: pytest.MonkeyPatch, by_outline: list[RowProfiles]) -> list[FrameContext]:
