@@ -100,9 +100,7 @@ def has_stated_readout(camera: FrameCamera, frame: Frame) -> bool:
 def cameras_by_slots(
     context: FrameContext, screens: Sequence[ScreenProfile]
 ) -> Iterator[tuple[ScreenProfile, FrameCamera]]:
-    """Cameras by the spectral line of the slot rate alone, each with the screens whose exposure the stripes may show.
-
-    The screen whose exposure is the likeliest comes first.
+    """Cameras by the spectral line of the slot rate alone, each with every screen.
 
     Args:
         context: the frame.
@@ -116,11 +114,7 @@ def cameras_by_slots(
             hypotheses = propose_slots(_strips(unknown, profiles), may_bend=frame.mosaic is None)
         for hypothesis in hypotheses:
             camera = estimated_camera(hypothesis, screens[0].slot_rate_hz, frame)
-            own = [(s, relabelled_camera(camera, s, frame)) for s in screens if s.columns == n_columns]
-            off = [abs(np.log(c.exposure_s * s.slot_rate_hz / hypothesis.exposure_slots)) for s, c in own]
-            near = max(min(off), SETTINGS.near_exposures)
-            ranked = sorted(zip(off, range(len(own)), strict=True))
-            yield from (own[number] for distance, number in ranked if distance <= near)
+            yield from ((s, relabelled_camera(camera, s, frame)) for s in screens if s.columns == n_columns)
 
 
 def estimated_camera(hypothesis: CameraHypothesis, slot_rate_hz: float, frame: Frame) -> FrameCamera:

@@ -77,9 +77,8 @@ class SearchSettings(msgspec.Struct, frozen=True):
     cut_lead: float = 1.0
     #: Room light that is tried where no header is in view, relative to its estimate, which counts what is lit in part.
     cut_room_lights: tuple[float, ...] = (1.0, 0.8, 0.6)
-    #: Natural logarithm of the ratio of exposures, stated and by the width of stripes, up to which they may agree.
-    near_exposures: float = 0.7
-    #: The same of readouts: cameras state that of the sensor, and a frame may show a part of it.
+    #: Natural logarithm of the ratio of readouts, stated and estimated, up to which they may agree: cameras state that
+    #: of the sensor, and a frame may show a part of it.
     near_readouts: float = 0.3
 
     #: Fits of the exposure; shortest one, slots, that the light shows; standard deviation of its logarithm; and least
