@@ -129,9 +129,7 @@ class Proposer:
         is_long = clock is not None and clock.exposure_slots > LONG_EXPOSURE_SLOTS
         if clock is None or clock.header_peak_ratio < (1.0 if is_long else SETTINGS.min_lead):
             return None
-        lead = np.log(clock.header_peak_ratio / SETTINGS.clear_lead)
-        log_prior = hypothesis.log_prior + SETTINGS.lead_weight * min(float(lead), 0.0)
-        return replace(hypothesis, clock=clock, profiles=profiles, log_prior=log_prior)
+        return replace(hypothesis, clock=clock, profiles=profiles)
 
     def siblings(self, scored: Scored) -> Iterator[Hypothesis]:
         """Hypotheses that differ from a scored one in one respect, with their changed log prior."""

@@ -165,7 +165,7 @@ class _Walk:
                 if found is None:
                     self._tried.append(Tried(hypothesis, 0.0, hypothesis.log_prior, "no clock"))
                 else:
-                    self._push(queue, -key + found.log_prior - hypothesis.log_prior, found)
+                    self._push(queue, -key, found)
                 continue
             self._score(hypothesis)
             if self._is_hopeless():

@@ -30,9 +30,7 @@ class SearchSettings(msgspec.Struct, frozen=True):
     reach: float = 3.0
     #: Number of columns up to which all are measured at once, not the middle half first.
     few_columns: int = 8
-    #: Header lead (peak over rival) of a certain clock, log prior lost per e-fold below it, minimum lead of a clock.
-    clear_lead: float = 3.0
-    lead_weight: float = 2.0
+    #: Minimum header lead (peak over rival) of a clock.
     min_lead: float = 1.6
     #: Log prior lost by each further camera.
     next_camera: float = 0.5
