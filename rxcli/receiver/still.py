@@ -1,6 +1,6 @@
 """Reception of a still from its clock: light model and detection in turn. Part of the wiring."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -186,8 +186,14 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
     lit = single.on_grid(alone.lit)
     metrics = channel.metrics_of(llr_of(lit), 1)
-    clock = in_bursts(acquisition, clock, metrics)
-    bursts = of_bursts(clock, lit)
+    some = _some(columns)
+
+    def evidence(clock: Clock) -> FloatArray:
+        bursts = _of_weights(ratios.burst_samples(by_start, clock, model, some, lit), alone.w_log_prob[some])
+        return np.asarray(survivors.lane_log_evidence(bursts, QUICK_SURVIVORS).reshape(-1, some.size).sum(axis=0))
+
+    clock, _ = _ways_by_evidence(acquisition, clock, metrics, evidence)[0]
+    bursts = _with_weights(of_bursts(clock, lit), alone.w_log_prob)
     posteriors = survivors.detect(bursts, QUICK_SURVIVORS)
     free = survivors.free_log_evidence(bursts, QUICK_SURVIVORS)
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
@@ -230,12 +236,19 @@ def _joint_samples(
     clock, columns = acquisition.clock, np.arange(len(acquisition.profiles.light))
     samples = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
     bursts = ratios.burst_samples(samples, clock, model, columns, lit)
-    return samples, _with_weights(bursts, w_log_prob, np.full((bursts.n_bursts, 1, 1), STILL.min_weight_log_prior))
+    return samples, _with_weights(bursts, w_log_prob, are_open=True)
 
 
-def _with_weights(bursts: BurstSamples, w_log_prob: FloatArray, least: FloatArray) -> BurstSamples:
-    """Bursts whose paths begin with the weights' log probability (C, 9), by burst and column no less than `least`."""
-    log_prior = np.maximum(w_log_prob, least) / bursts.n_bursts
+def _with_weights(
+    bursts: BurstSamples, w_log_prob: FloatArray, *, are_known: bool = False, are_open: bool = False
+) -> BurstSamples:
+    """Bursts whose paths begin with the weights' log probability (C, 9); bursts in which these show may find others.
+
+    Paths that see nothing of a packet's start would keep the weights of fewest words, unless the picture is known.
+    """
+    is_open = (survivors.shows_weight(bursts)[..., None] | are_open) & (not are_known)
+    log_prior = np.maximum(w_log_prob, np.where(is_open, STILL.min_weight_log_prior, STILL.no_weight))
+    log_prior = log_prior / bursts.n_bursts
     return replace(bursts, w_log_prior=log_prior.reshape(-1, len(WEIGHTS)))
 
 
@@ -282,11 +295,7 @@ def follow_picture(
     if acquisition.profiles.has_row_noise and not reception.is_long:
         samples = denoise.remove_row_noise(samples, ratios.whole_light(lit, clock, model.crosstalk, q), model)
     bursts = ratios.burst_samples(samples, clock, model, columns, lit)
-    if not reception.is_long:
-        # Paths that see nothing of a packet's start would keep the weights of fewest words.
-        dimming = reception.n_observed[:, columns, SLOTS_PER_SYMBOL:PREAMBLE_SLOTS].sum(axis=2, keepdims=True)
-        least = np.where((dimming > 0) & (not keeps_weights), STILL.min_weight_log_prior, STILL.no_weight)
-        bursts = _with_weights(bursts, reception.posteriors.w_log_prob[columns], least)
+    bursts = _with_weights(bursts, reception.posteriors.w_log_prob[columns], are_known=keeps_weights)
     # Of long exposures columns are too rarely right to show what they have in common.
     found = survivors.detect(bursts, has_common_weights=not reception.is_long)
     header_llr, log_prob = reception.posteriors.header_llr[:, columns], found.log_prob
@@ -311,15 +320,13 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
     The start of packets was found by the ends of exposures, which stay where they are.
     """
     every, some = np.arange(len(reception.snr)), _some(columns)
+    weights = reception.posteriors.w_log_prob[some]
     lit = reception.clock.on_grid(reception.posteriors.lit)
-    w_log_prior = reception.posteriors.w_log_prob[some] + np.log(len(WEIGHTS))
 
     def evidence(clock: Clock, levels: list[float]) -> FloatArray:
         samples, model = _view(acquisition, reception, every, STILL.coarse_samples, ratios.by_start(clock))
         models = (replace(model, black_level=level) for level in levels)
-        parts = [ratios.burst_samples(samples, clock, each, some, lit) for each in models]
-        # A column has one weight, whatever its bursts: they must not pay for it each.
-        parts = [replace(part, w_log_prior=np.tile(w_log_prior, (part.n_bursts, 1))) for part in parts]
+        parts = [_of_weights(ratios.burst_samples(samples, clock, each, some, lit), weights) for each in models]
         by_lane = survivors.lane_log_evidence(survivors.side_by_side(parts), QUICK_SURVIVORS)
         return np.asarray(by_lane.reshape(len(levels), -1, some.size).sum(axis=1))
 
@@ -329,11 +336,8 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
     light = reception.samples.light[reception.samples.valid > 0]
     levels = [float(np.percentile(light, STILL.dark_percent)) * share for share in STILL.dark_shares]
     level = levels[int(evidence(clock, levels).sum(axis=1).argmax())]
-    ways = [way for way, _ in sync.possible_bursts(clock, slot_llr(reception.metrics), acquisition.repeats)]
-    by_column = np.concatenate([evidence(way, [level]) for way in ways])
-    gains = np.clip(by_column - by_column[0], -STILL.max_column_gain, STILL.max_column_gain).sum(axis=1)
-    best = ways[int(gains.argmax())]
-    by_evidence = [(way.burst, gain) for way, gain in zip(ways, gains.tolist(), strict=True)]
+    ways = _ways_by_evidence(acquisition, clock, reception.metrics, lambda way: evidence(way, [level])[0])
+    (best, _), by_evidence = ways[0], [(way.burst, gain) for way, gain in ways]
     refined = replace(
         reception, clock=best, model=replace(reception.model, black_level=level), bursts_by_evidence=by_evidence
     )
@@ -343,6 +347,23 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
     header_llr = np.repeat(reception.posteriors.header_llr[:1], len(posteriors.header_llr), axis=0)
     log_evidence = reception.posteriors.log_evidence
     return replace(refined, posteriors=replace(posteriors, header_llr=header_llr, log_evidence=log_evidence))
+
+
+def _ways_by_evidence(
+    acquisition: Acquisition, clock: Clock, metrics: FloatArray, evidence: Callable[[Clock], FloatArray]
+) -> list[tuple[Clock, float]]:
+    """Assignments of copies to bursts, likeliest first, each with its lead in the log evidence of some columns."""
+    ways = [way for way, _ in sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)]
+    if len(ways) == 1:
+        return [(ways[0], 0.0)]
+    by_column, most = np.stack([evidence(way) for way in ways]), STILL.max_column_gain
+    gains = np.clip(by_column - by_column[0], -most, most).sum(axis=1).tolist()
+    return sorted(zip(ways, gains, strict=True), key=lambda way: -way[1])
+
+
+def _of_weights(bursts: BurstSamples, w_log_prob: FloatArray) -> BurstSamples:
+    """Bursts whose evidence is that of weights with a log probability (C, 9): they must not pay for one each."""
+    return replace(bursts, w_log_prior=np.tile(w_log_prob + np.log(len(WEIGHTS)), (bursts.n_bursts, 1)))
 
 
 def _exposed_for(clock: Clock, factor: float) -> Clock:

@@ -20,16 +20,26 @@ UNKNOWN = np.full((COLUMNS, len(WEIGHTS)), -np.log(len(WEIGHTS)))
 
 
 def rough_frame(
-    exposure_slots: float, texture: float, n_columns: int = COLUMNS, row_noise: float = 0.0
+    exposure_slots: float,
+    texture: float,
+    n_columns: int = COLUMNS,
+    row_noise: float = 0.0,
+    copies: tuple[int, ...] = (0,),
+    shown: slice = slice(0, None),
 ) -> tuple[Acquisition, ObservationModel, Float32Array]:
-    """One packet in every column, whose picture changes from row to row; and the slots that were sent."""
+    """Packets in every column, whose picture changes from row to row; and the slots that were sent.
+
+    Of the bursts in `copies`, one after the other, the slots in `shown` are in view.
+    """
     rng = np.random.default_rng(4)
     screen = load_profile("paper-8k65", ScreenProfile)
     n = screen.packet_slots
-    bits = rng.integers(0, 2, (n_columns, screen.payload_symbols * 7)).astype(np.uint8)
-    sent = np.stack([encode_packet(each, W) for each in bits]).astype(np.float32)
-    known = {"rows_per_slot": ROWS_PER_SLOT, "exposure_slots": exposure_slots, "packet_slots": n, "n_slots": n}
-    rows = np.arange(int(n * ROWS_PER_SLOT))
+    bits = rng.integers(0, 2, (max(copies) + 1, n_columns, screen.payload_symbols * 7)).astype(np.uint8)
+    packets = np.stack([[encode_packet(each, W) for each in burst] for burst in bits]).astype(np.float32)
+    sent = np.concatenate([packets[burst] for burst in copies], axis=1)[:, shown]
+    known = {"rows_per_slot": ROWS_PER_SLOT, "exposure_slots": exposure_slots, "packet_slots": n}
+    known |= {"n_slots": sent.shape[1], "first_slot": shown.start, "burst": np.array(copies)}
+    rows = np.arange(int(sent.shape[1] * ROWS_PER_SLOT))
     exposed = SlotLight(np.pad(sent, ((0, 0), (5, 5)))).mean_over(
         ((rows + 0.5) / ROWS_PER_SLOT + 5)[None], exposure_slots
     )
@@ -93,3 +103,21 @@ def test_the_clock_is_placed_by_evidence(late: float) -> None:
     clock = acquisition.clock
     moved = replace(acquisition, clock=replace(clock, row0=clock.row0 + late * ROWS_PER_SLOT))
     assert lateness(moved, model, UNKNOWN, 0.25) == pytest.approx(late, abs=0.1)
+
+
+@pytest.mark.parametrize("copies", [(0, 0), (0, 1)])
+def test_copies_with_little_in_common_are_assigned_by_their_joint_evidence(copies: tuple[int, int]) -> None:
+    """The first copy shows no weight: it has that of the second, whichever burst it is of."""
+    acquisition, _, sent = rough_frame(4.0, texture=0.1, copies=copies, shown=slice(20, 105))
+    found = initial_pass(replace(acquisition, profiles=replace(acquisition.profiles, level=None)))
+    assert found.clock.burst.tolist() == list(copies)
+    assert (found.posteriors.w == W).all()
+    assert np.mean((found.clock.on_grid(found.posteriors.lit) > 0.5) != (sent > 0.5)) < 0.06
+
+
+@pytest.mark.parametrize(("lit", "expected"), [(slice(4, 8), [3, 4, 5, 6]), (slice(0, 3), [1, 2, 3, 4])])
+def test_the_brighter_half_of_the_columns_leaves_out_the_outermost(lit: slice, expected: list[int]) -> None:
+    light = np.full((8, STRIPS, 30), 0.1)
+    light[lit] = 1.0
+    screen = structs.replace(load_profile("paper-8k65", ScreenProfile), columns=8)
+    assert Acquisition(screen, profiles_of(light), clock_of(8), (screen,)).bright_columns.tolist() == expected

@@ -19,7 +19,7 @@ from rxcli.receiver.clip.views import Waiting
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
-from rxcli.receiver.plane import without_texture
+from rxcli.receiver.plane import CommonTexture
 from rxcli.receiver.receive import receive
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, cameras
@@ -95,8 +95,9 @@ def textured() -> Clip:
 
 def test_the_texture_that_frames_have_in_common_hides_no_columns(textured: Clip) -> None:
     corners = textured.options.corners
-    (first, *later), column_px = textured.frames[:8], np.ptp(corners[:, 0]) / 20
-    found = possible_screens(FrameCache(without_texture(first, later, "srgb")), ReceiverOptions())
+    column_px = np.ptp(corners[:, 0]) / 20
+    flat = CommonTexture(textured.frames[:8], "srgb").removed_from(0)
+    found = possible_screens(FrameCache(flat), ReceiverOptions())
     assert np.abs(found[0][0].corners - corners)[:, 0].max() < 0.6 * column_px
 
 

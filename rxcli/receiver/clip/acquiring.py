@@ -20,7 +20,7 @@ from rxcli.receiver.clip.scene import followed_outline
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Failure
-from rxcli.receiver.plane import shift_of_texture, shows_same, without_texture
+from rxcli.receiver.plane import CommonTexture, shows_same
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.registration import ScreenTexture
 from rxcli.receiver.search import Found
@@ -61,7 +61,9 @@ class HiddenFrames:
     def shown(self, camera: ClipCamera) -> FirstFrames | Failure:
         """The frames with what the first of them shows, by itself or without what all of them have in common."""
         alone, found = self.alone, self._without_texture(camera) if len(self.frames) > 1 else None
-        if found is not None and (isinstance(alone, Failure) or alone.is_bent or found.evidence > alone.evidence):
+        if found is not None and (
+            isinstance(alone, Failure) or alone.is_bent or alone.is_long or found.evidence > alone.evidence
+        ):
             return found
         if isinstance(alone, Failure):
             return alone
@@ -76,13 +78,16 @@ class HiddenFrames:
 
         None where it shows no packets.
         """
-        flat = FrameCache(self._flat(0))
+        texture = CommonTexture(self.frames, DEFAULT_TONE)
+        flat = FrameCache(texture.removed_from(0))
         if not shows_same(self.frames[0], flat.frame, DEFAULT_TONE):
             return None
-        agreed = self._places_that_agree(camera, flat)
+        agreed = self._places_that_agree(camera, texture, flat)
         if not agreed:
             return None
         surest = max(agreed, key=lambda place: place.located.evidence)
+        if surest.located is self.alone:
+            return None
         best, corners = surest.located, surest.corners
         assert isinstance(best.found, Found)
         if camera.options.corners is not None:  # They hold for every frame.
@@ -97,16 +102,17 @@ class HiddenFrames:
         located = Located(outline, context, None, best.framing)
         return FirstFrames(self.frames, located, start=start_by(best.found, self.frames))
 
-    def _places_that_agree(self, camera: ClipCamera, flat: FrameCache) -> list[Place]:
+    def _places_that_agree(self, camera: ClipCamera, texture: CommonTexture, flat: FrameCache) -> list[Place]:
         """What some frames show without their texture and agree on; `flat` is the first of them so."""
         alone = self.alone if isinstance(self.alone, Located) and self.alone.shows_packets else None
         shown = [Place.of(alone)] if alone is not None and alone.is_long and not alone.is_bent else []
         agreed: list[Place] = []
         for share in SETTINGS.searched_frames:
             number = int(share * len(self.frames)) - int(share == 1)
-            found = camera.locate(FrameCache(self._flat(number)) if number else flat, may_bend=False)
+            cache = FrameCache(texture.removed_from(number)) if number else flat
+            found = camera.locate(cache, may_bend=False)
             if isinstance(found, Located) and self._was_hidden(found):
-                shown.append(Place.of(found, self._motion(number)))
+                shown.append(Place.of(found, texture.shifts[number]))
                 agreed = agreeing(shown)
             elif alone is not None and not alone.is_long:
                 break
@@ -117,15 +123,6 @@ class HiddenFrames:
     def _was_hidden(self, located: Located) -> bool:
         """Whether packets were found that the texture had hidden."""
         return located.shows_packets and (located.is_long or isinstance(self.alone, Failure))
-
-    def _flat(self, number: int) -> Frame:
-        """A frame without its texture."""
-        rest = [*self.frames[:number], *self.frames[number + 1 :]]
-        return without_texture(self.frames[number], rest, DEFAULT_TONE)
-
-    def _motion(self, number: int) -> FloatArray:
-        """(2,) pixels by which the screen moves from the first frame to another one."""
-        return shift_of_texture(self.frames[0], self.frames[number], DEFAULT_TONE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

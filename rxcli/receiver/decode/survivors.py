@@ -32,7 +32,7 @@ from rxcli.protocol import (
 from rxcli.receiver.decode.detect import llr_of_bits, log_of_best, preamble_slots, weight_shares
 from rxcli.receiver.decode.settings import SURVIVORS, SurvivorSettings
 from rxcli.receiver.light import exposed_from
-from rxcli.types import BurstPosteriors, BurstSamples, Float32Array, FloatArray, IntArray
+from rxcli.types import BoolArray, BurstPosteriors, BurstSamples, Float32Array, FloatArray, IntArray
 
 #: Log probability of what cannot be.
 _NEVER = -1e9
@@ -100,8 +100,9 @@ def detect(
             followed.append((lanes, words))
             w_log_prob[lanes] = _weight_log_prob(*(words or [_posterior(paths)])[0])
             evidence[lanes] = _log_evidence(paths, part, settings)
-    # One weight for all bursts of a column.
-    w_log_prob = w_log_prob.reshape(n_bursts, n_columns, -1).sum(axis=0)
+    # One weight for all bursts of a column; without the symbol that shows it, its paths may have been dropped.
+    shown, by_burst = shows_weight(samples)[..., None], w_log_prob.reshape(n_bursts, n_columns, -1)
+    w_log_prob = (by_burst * (shown | ~shown.any(axis=0))).sum(axis=0)
     w_log_prob = w_log_prob - np.logaddexp.reduce(w_log_prob, axis=1, keepdims=True)
     common = np.log(weight_shares(w_log_prob)) if has_common_weights else 0.0
     w = (w_log_prob + common).argmax(axis=1) + 1
@@ -131,6 +132,12 @@ def _part(samples: BurstSamples, lanes: IntArray, n_slots: int) -> BurstSamples:
     of_lanes: dict[str, Any] = {"light": light, "noise": noise, "valid": valid, "neighbours": neighbours, "n_bursts": 1}
     prior = None if samples.w_log_prior is None else samples.w_log_prior[lanes]
     return replace(samples, **of_lanes, log_scale=samples.log_scale[lanes], w_log_prior=prior)
+
+
+def shows_weight(samples: BurstSamples) -> BoolArray:
+    """(B, C) whether more than half of the dimming symbol of each burst is in view."""
+    share = samples.valid[SLOTS_PER_SYMBOL:PREAMBLE_SLOTS].max(axis=3).mean(axis=(0, 1))
+    return np.asarray(share.reshape(samples.n_bursts, samples.n_columns) > 0.5)
 
 
 def lane_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> FloatArray:

@@ -39,11 +39,15 @@ class Acquisition:
         """The screen that sends a packet `repeats` times."""
         return next((screen for screen in self.variants if screen.repeats == repeats), self.screen)
 
-    @property
-    def middle_columns(self) -> IntArray:
-        """Numbers of the middle half of the columns."""
-        n_columns = self.screen.columns
-        return np.arange(n_columns // 4, n_columns - n_columns // 4)
+    @cached_property
+    def bright_columns(self) -> IntArray:
+        """Numbers of the half of the columns, side by side and without the outermost, that has the most light."""
+        profiles, n_columns = self.profiles, self.screen.columns
+        n, start = n_columns - 2 * (n_columns // 4), min(n_columns // 4, 1)
+        n_inside = np.maximum(profiles.inside.sum(axis=(1, 2)), 1)
+        light = np.append(0.0, np.cumsum((profiles.light * profiles.inside).sum(axis=(1, 2)) / n_inside))
+        light = light[start : n_columns - start + 1]
+        return start + int((light[n:] - light[:-n]).argmax()) + np.arange(n)
 
     def of_columns(self, part: IntArray | slice) -> Acquisition:
         """The acquisition of some columns."""

@@ -23,27 +23,39 @@ _WHITE = 65535
 _TEXTURE_LIMIT = 1.2
 
 
-def without_texture(frame: Frame, frames: Sequence[Frame], tone: str) -> Frame:
-    """The light of a frame over the mean of other frames, at its level.
+class CommonTexture:
+    """The texture that frames of a clip have in common; it is summed once, where the first of them has it.
 
     Args:
-        frame: a developed picture.
-        frames: others of the same camera, of as many pixels; at least one.
+        frames: developed pictures of one camera, of as many pixels; at least two.
         tone: the curve to undo, see `tone_to_light`.
     """
-    import cv2
 
-    table = _light_of_values(frame, tone)
-    light = table.take(frame.pixels)
-    mean, texture = np.zeros_like(light), _gradient(light)
-    for each in frames:
-        mean += _moved(table.take(each.pixels), texture)
-    mean /= np.float32(len(frames))
-    light *= cv2.blur(mean, (1, round(_LEVEL_SHARE * frame.height)))
-    light /= mean
-    light -= np.float32(_ADDED_LIGHT)
-    pixels = np.rint(np.clip(light, 0, 1, out=light) * np.float32(_WHITE)).astype(np.uint16)
-    return replace(frame, pixels=pixels, black=0.0, white=float(_WHITE), linear=True, colours=None)
+    def __init__(self, frames: Sequence[Frame], tone: str) -> None:
+        self._frames, self._table = frames, _light_of_values(frames[0], tone)
+        self._total = self._light(0)
+        texture = _gradient(self._total)
+        #: Of each frame, (2,) pixels x and y from where its texture is in the first one.
+        self.shifts = [np.zeros(2)]
+        for number in range(1, len(frames)):
+            light = self._light(number)
+            self.shifts.append(-_shift(light, texture))
+            self._total += _moved(light, -self.shifts[number])
+
+    def removed_from(self, number: int) -> Frame:
+        """The light of a frame over the mean of the others, at its level."""
+        import cv2
+
+        frame, light, shift = self._frames[number], self._light(number), self.shifts[number]
+        mean = _moved(self._total - _moved(light, -shift), shift) / np.float32(len(self._frames) - 1)
+        light *= cv2.blur(mean, (1, round(_LEVEL_SHARE * frame.height)))
+        light /= mean
+        light -= np.float32(_ADDED_LIGHT)
+        pixels = np.rint(np.clip(light, 0, 1, out=light) * np.float32(_WHITE)).astype(np.uint16)
+        return replace(frame, pixels=pixels, black=0.0, white=float(_WHITE), linear=True, colours=None)
+
+    def _light(self, number: int) -> Float32Array:
+        return self._table.take(self._frames[number].pixels)
 
 
 def shows_same(frame: Frame, flat: Frame, tone: str) -> bool:
@@ -51,24 +63,17 @@ def shows_same(frame: Frame, flat: Frame, tone: str) -> bool:
 
     Args:
         frame: a frame.
-        flat: the same `without_texture`; that of another picture is added to the frame's own.
+        flat: the same without its `CommonTexture`; that of another picture is added to the frame's own.
         tone: of the frame.
     """
     before, after = (_gradient(_light_of_values(each, tone).take(each.pixels)) for each in (frame, flat))
     return float(np.abs(after).mean()) <= _TEXTURE_LIMIT * float(np.abs(before).mean())
 
 
-def shift_of_texture(frame: Frame, to: Frame, tone: str) -> FloatArray:
-    """(2,) pixels x and y from where the texture of a frame is to where it is in another one."""
-    table = _light_of_values(frame, tone)
-    return _shift(table.take(frame.pixels), _gradient(table.take(to.pixels)))
-
-
-def _moved(light: Float32Array, texture: Float32Array) -> Float32Array:
-    """The light of a frame, moved so that its texture is where that of another one is."""
+def _moved(light: Float32Array, shift: FloatArray) -> Float32Array:
+    """Light moved by (2,) pixels x and y."""
     import cv2
 
-    shift = _shift(light, texture)
     if np.abs(shift).max() < _STILL_PX:
         return light
     motion = np.array([[1, 0, shift[0]], [0, 1, shift[1]]])

@@ -43,10 +43,10 @@ def tempered(reception: Reception, evidence: float) -> float:
     return SETTINGS.temper * (evidence + SETTINGS.complete_packet * bool(reception.is_complete.any()))
 
 
-def middle_score(scored: Scored) -> float:
-    """Score of the middle half of the columns of a hypothesis."""
-    middle = scored.reception.of_columns(scored.acquisition.middle_columns)
-    return score(middle, log_evidence(middle), scored.hypothesis.log_prior)
+def bright_score(scored: Scored) -> float:
+    """Score of the brighter half of the columns of a hypothesis."""
+    bright = scored.reception.of_columns(scored.acquisition.bright_columns)
+    return score(bright, log_evidence(bright), scored.hypothesis.log_prior)
 
 
 def distinct_share(reception: Reception) -> float:

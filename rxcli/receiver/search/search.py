@@ -141,7 +141,7 @@ class _Walk:
         self._scored: list[Scored] = []
         self._tried: list[Tried] = []
         self._asked: set[tuple[object, ...]] = set()
-        #: Long exposures whose middle columns showed no packets.
+        #: Long exposures whose bright columns showed no packets.
         self._n_in_vain = 0
         self._number = count()
         self._fresh: list[_Entry] = []
@@ -242,9 +242,9 @@ class _Walk:
         return (self._fresh, heapq.heappop(self._fresh)) if self._fresh else None
 
     def _score(self, hypothesis: Hypothesis) -> None:
-        """Make an initial pass; after a better hypothesis, and of a long exposure, of the middle columns first.
+        """Make an initial pass; after a better hypothesis, and of a long exposure, of the bright columns first.
 
-        The others follow if the middle ones come near the best score; if that is beyond doubt, if they beat its own.
+        The others follow if the bright ones come near the best score; if that is beyond doubt, if they beat its own.
         """
         best, acquisition = self._best(), _acquired(hypothesis)
         # Without packets an estimated camera is rejected, and joint detection takes long.
@@ -252,15 +252,15 @@ class _Walk:
         if is_costly and self._n_in_vain >= SETTINGS.doubtful_budget:
             return
         if (best is not None or is_costly) and hypothesis.screen.columns > SETTINGS.few_columns:
-            half = self._measured(hypothesis, acquisition.of_columns(acquisition.middle_columns))
+            half = self._measured(hypothesis, acquisition.of_columns(acquisition.bright_columns))
             min_score, min_evidence, lead = -np.inf, PASSES.min_packets_llr, 0.0
             if best is not None:
-                lead = evidence.middle_score(best) - best.score if best.evidence > PASSES.min_packets_llr else 0.0
+                lead = evidence.bright_score(best) - best.score if best.evidence > PASSES.min_packets_llr else 0.0
                 is_plain = best.evidence > SETTINGS.plain
                 min_score = best.score + (lead if is_plain else -SETTINGS.reach)
                 min_evidence = min(PASSES.min_packets_llr, best.evidence)
             if half.score < min_score or half.evidence < max(min_evidence, self._least / 2):
-                # By the middle columns alone scores are others than by all: the best one shows by how much.
+                # By the bright columns alone scores are others than by all: the best one shows by how much.
                 self._tried.append(Tried(hypothesis, half.evidence, half.score - lead, "half"))
                 self._n_in_vain += is_costly and half.evidence < PASSES.min_packets_llr
                 return

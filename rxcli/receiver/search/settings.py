@@ -28,7 +28,7 @@ class SearchSettings(msgspec.Struct, frozen=True):
     #: Siblings of a scored hypothesis get a pass if their score could come this near to the best one; log-odds within
     #: which an outline is possible.
     reach: float = 3.0
-    #: Number of columns up to which all are measured at once, not the middle half first.
+    #: Number of columns up to which all are measured at once, not the brighter half first.
     few_columns: int = 8
     #: Minimum header lead (peak over rival) of a clock.
     min_lead: float = 1.6

@@ -154,7 +154,7 @@ def test_columns_with_packets_are_not_left_out_of_the_screen() -> None:
     assert max(one.log_odds for one in less_likely) < -3.0
 
 
-def test_scores_by_the_middle_columns_compare_with_those_by_all() -> None:
+def test_scores_by_the_bright_columns_compare_with_those_by_all() -> None:
     trial = trial_of("paper-17k3")
     options = ReceiverOptions(cameras=(trial.camera,), force_camera=True)
     outlines = [Outline(trial.corners, log_odds=-odds, family=family) for family, odds in enumerate((0.0, 1.0))]
@@ -172,12 +172,12 @@ def test_scores_by_the_middle_columns_compare_with_those_by_all() -> None:
         pytest.param(1.0, 100.0, 300.0, ["all", *["middle"] * 4], id="not all if more evidence is needed"),
     ],
 )
-def test_hypotheses_are_measured_on_their_middle_columns_first(
+def test_hypotheses_are_measured_on_their_bright_columns_first(
     exposure_slots: float, evidence: float, least: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock, own = SimpleNamespace(exposure_slots=exposure_slots), list[str]()
     middle = SimpleNamespace(part="middle")
-    acquisition = SimpleNamespace(clock=clock, part="all", middle_columns=None, of_columns=lambda _: middle)
+    acquisition = SimpleNamespace(clock=clock, part="all", bright_columns=None, of_columns=lambda _: middle)
 
     def measure(_: object, __: object, acquisition: Any) -> Any:
         own.append(acquisition.part)
@@ -188,7 +188,7 @@ def test_hypotheses_are_measured_on_their_middle_columns_first(
     estimated: Any = SimpleNamespace(camera=SimpleNamespace(hypothesis=1), screen=SimpleNamespace(columns=20))
     monkeypatch.setattr(_Walk, "_fitted", lambda _, scored: scored)
     monkeypatch.setitem(_Walk.run.__globals__, "_in_likeliest_bursts", lambda scored: scored)
-    monkeypatch.setitem(_Walk.run.__globals__, "evidence", SimpleNamespace(middle_score=lambda _: 0.0))
+    monkeypatch.setitem(_Walk.run.__globals__, "evidence", SimpleNamespace(bright_score=lambda _: 0.0))
     proposer: Any = SimpleNamespace(siblings=lambda _: (), cameras=lambda: None)
     walk = _Walk(proposer, 8, least)
     for _ in range(5):
