@@ -51,8 +51,6 @@ class Metadata:
     model: str | None = None
     lens: str | None = None
     exposure_s: float | None = None
-    #: Time from the first row of a frame to the last, as the camera states it: right to several per cent.
-    readout_s: float | None = None
     iso: float | None = None
     focal_length_mm: float | None = None
     focal_length_35mm: float | None = None
@@ -60,6 +58,8 @@ class Metadata:
     orientation: int = 1
     #: Impossible values in the file, in words; the fields above are then None.
     not_believed: tuple[str, ...] = ()
+    #: Time from the first row of a frame to the last, as the camera states it: right to several per cent.
+    readout_s: float | None = None
 
     @property
     def names_front_camera(self) -> bool:

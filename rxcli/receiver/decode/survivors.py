@@ -135,9 +135,11 @@ def _part(samples: BurstSamples, lanes: IntArray, n_slots: int) -> BurstSamples:
 
 
 def shows_weight(samples: BurstSamples) -> BoolArray:
-    """(B, C) whether more than half of the dimming symbol of each burst is in view."""
-    share = samples.valid[SLOTS_PER_SYMBOL:PREAMBLE_SLOTS].max(axis=3).mean(axis=(0, 1))
-    return np.asarray(share.reshape(samples.n_bursts, samples.n_columns) > 0.5)
+    """(B, C) whether more than half of the dimming symbol of each burst is in view, and a word: the border errs."""
+    valid = samples.valid.max(axis=3).mean(axis=1)
+    n_dimming, n_payload = valid[SLOTS_PER_SYMBOL:PREAMBLE_SLOTS].sum(axis=0), valid[PREAMBLE_SLOTS:].sum(axis=0)
+    is_shown = (n_dimming > SLOTS_PER_SYMBOL / 2) & (n_payload >= SLOTS_PER_SYMBOL)
+    return np.asarray(is_shown.reshape(samples.n_bursts, samples.n_columns))
 
 
 def lane_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> FloatArray:
