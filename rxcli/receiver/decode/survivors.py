@@ -110,9 +110,11 @@ def detect(
     lit = np.empty((n_bursts, n_columns, n_slots), np.float32)
     index, log_prob = np.zeros(shape, np.int64), np.zeros(shape)
     bit_llr = np.full((*shape, 7), np.nan)
+    is_word = _counting(samples, reach)[1][PREAMBLE_SLOTS // SLOTS_PER_SYMBOL :, :, 0].T.reshape(shape)
     for weight in np.unique(w).tolist():
         columns = np.flatnonzero(w == weight)
         posterior = _word_posteriors(followed, weight, shape)[:, columns]
+        posterior[~is_word[:, columns]] = 1 / posterior.shape[-1]
         lit[:, columns, :PREAMBLE_SLOTS] = preamble_slots(weight)
         lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(weight)).reshape(n_bursts, columns.size, -1)
         index[:, columns] = best = posterior.argmax(axis=-1)
@@ -196,11 +198,12 @@ def _forward(
     paths = _start(samples, settings)
     steps: list[_Step] = []
     ends: list[tuple[int, _Paths]] = []
+    n_counting, is_followed = _counting(samples, reach)
     for n in range(n_slots + reach):
         symbol, place = divmod(n, SLOTS_PER_SYMBOL) if n < n_slots else (0, n - n_slots)
         is_dimming = symbol == 1 and n < n_slots
         book = _ARBITRARY if is_free else (_HEADER, _DIMMING)[symbol] if symbol < 2 else None
-        books = paths.w if book is None else 0 * paths.w + book
+        books = 0 * paths.w + book if book is not None else np.where(is_followed[symbol], paths.w, _ARBITRARY)
         origin, branches, gain = _branches(paths, books, place)
         if is_dimming and place == SLOTS_PER_SYMBOL - 1 and not is_free:
             branches.w = _n_lit()[branches.slots & _WORD]
@@ -211,9 +214,11 @@ def _forward(
         if n >= reach:
             gain = gain + settings.information * _update(branches, samples, n - reach, levels, settings)
         branches.log_likelihood = branches.log_likelihood + gain
-        is_within = n < n_slots and not is_free
-        # Paths that differ in their word so far differ still with a slot more.
-        n_recent = None if is_within and place >= reach else max(reach, place + 1) if is_within else reach
+        n_recent: IntArray | None = n_counting[n]
+        if n < n_slots and not is_free:
+            # Paths that differ in their word so far differ still with a slot more.
+            is_plain = place >= reach and is_followed[symbol].all()
+            n_recent = None if is_plain else np.maximum(n_counting[n], (place + 1) * is_followed[symbol])
         target, remaining = _merged(branches, n_recent, settings)
         is_start = np.ones(origin.size, bool)
         np.not_equal(origin[1:], origin[:-1], out=is_start[1:])
@@ -223,6 +228,28 @@ def _forward(
         if PREAMBLE_SLOTS <= n < n_slots and place == SLOTS_PER_SYMBOL - 1:
             ends.append((n, paths))
     return paths, steps, ends
+
+
+def _counting(samples: BurstSamples, reach: int) -> tuple[IntArray, BoolArray]:
+    """What the samples in view leave of a path's past.
+
+    Returns:
+        (slots + reach, lanes, 1) number of last slots that a later sample sees; and (symbols, lanes, 1) whether a
+        symbol is followed as a word. Of one that is mostly out of view there are as many words as there may be, so that
+        it is followed as arbitrary slots.
+    """
+    in_view: BoolArray = np.asarray((samples.valid > 0).any(axis=(1, 3)))
+    n_slots, lanes = in_view.shape
+    slot, after = np.arange(n_slots + reach)[:, None], np.full(lanes, n_slots + reach)
+    later = np.vstack([np.where(in_view, slot[:n_slots], n_slots + reach), np.tile(after, (reach, 1))])
+    later = np.minimum.accumulate(later[::-1])[::-1]
+    # The sample of slot n - reach is used up with slot n.
+    next_sample = np.vstack([later, np.tile(after, (reach, 1))])[np.maximum(slot[:, 0] + 1 - reach, 0)]
+    n_counting = np.clip(slot + 1 - next_sample, 0, reach)
+    exposed = np.array([in_view[max(n + 1 - reach, 0) : n + 1].any(axis=0) for n in range(n_slots)])
+    is_followed = exposed.reshape(-1, SLOTS_PER_SYMBOL, lanes).sum(axis=1) > SLOTS_PER_SYMBOL // 2
+    is_followed[: PREAMBLE_SLOTS // SLOTS_PER_SYMBOL] = True
+    return n_counting[..., None], is_followed[..., None]
 
 
 def _start(samples: BurstSamples, settings: SurvivorSettings) -> _Paths:
@@ -316,8 +343,10 @@ def _update(
     return np.asarray(total / (2 * q), np.float64)
 
 
-def _merged(branches: _Paths, n_recent: int | None, settings: SurvivorSettings) -> tuple[IntArray, _Paths]:
-    """Merge branches that agree in weight and in the last `n_recent` slots, and keep the likeliest; None: all differ.
+def _merged(branches: _Paths, n_recent: IntArray | None, settings: SurvivorSettings) -> tuple[IntArray, _Paths]:
+    """Merge branches that agree in weight and in their lane's last `n_recent` slots, and keep the likeliest.
+
+    None: all differ.
 
     Returns:
         (lanes, J) the path that a branch is part of, -1 if it was dropped; the paths.
@@ -348,12 +377,12 @@ def _merged(branches: _Paths, n_recent: int | None, settings: SurvivorSettings) 
     return place_of[group], paths
 
 
-def _groups(branches: _Paths, n_recent: int) -> tuple[IntArray, IntArray, int]:
+def _groups(branches: _Paths, n_recent: IntArray) -> tuple[IntArray, IntArray, int]:
     """Groups of branches that agree: (lanes, groups) number of the likeliest branch; (lanes, J) that of its group."""
     likelihood = branches.log_likelihood
     lanes, n_branches = likelihood.shape
     lane = np.arange(lanes)[:, None]
-    key = (branches.w << 2 * SLOTS_PER_SYMBOL) | (branches.slots & ((1 << n_recent) - 1))
+    key = (branches.w << 2 * SLOTS_PER_SYMBOL) | (branches.slots & ((np.int64(1) << n_recent) - 1))
     place = np.lexsort((-likelihood, key)) + n_branches * lane
     ordered = key.take(place)
     is_first = np.ones((lanes, n_branches), bool)

@@ -161,3 +161,24 @@ def test_few_paths_are_enough_and_packets_beat_arbitrary_slots() -> None:
     other = rng.integers(0, 2, (4, 80)).astype(np.int64)
     noise = samples([np.concatenate([slots, HEADER]) for slots in other], 4.0, rng, 0.02, 0.05)
     assert (detect(noise).log_evidence < free_log_evidence(noise)).all()
+
+
+@pytest.mark.parametrize("exposure_slots", [1.1, 6.0])
+@pytest.mark.parametrize(("first", "last"), [(27, 80), (0, 52), (33, 64)])
+def test_words_that_are_mostly_out_of_view_are_open_and_leave_the_next_alone(
+    exposure_slots: float, first: int, last: int
+) -> None:
+    """A packet that is cut before slot `first` and after `last`: what is not in view has no say in what is."""
+    rng = np.random.default_rng(12)
+    index = rng.integers(0, 128, (8, 6))
+    burst = samples([packet(one, 5) for one in index], exposure_slots, rng, 0.01, 0.02)
+    burst.valid[:first] = 0
+    burst.valid[last:] = 0
+    known = np.full((8, len(WEIGHTS)), -20.0)
+    known[:, 5 - 1] = 0.0
+    found = detect(replace(burst, w_log_prior=known))
+    start, end = 20 + 10 * np.arange(6), 30 + 10 * np.arange(6)
+    whole = (start >= first) & (end <= last)
+    out_of_view = (end <= first + 4) | (start >= last + np.ceil(exposure_slots) - 5)
+    assert (found.index[0][:, whole] == index[:, whole]).mean() > 0.95
+    assert np.allclose(found.log_prob[0][:, out_of_view], -np.log(1 << bits_per_symbol(5)))
