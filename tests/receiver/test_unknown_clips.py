@@ -61,8 +61,11 @@ def test_a_clip_of_long_exposures_is_received(exposure_slots: float) -> None:
 def test_frames_that_decide_picture_and_slots_together_are_measured_twice(
     exposure_slots: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The picture of few frames leaves wrong slots that look sure; a frame received alone decides jointly, too."""
-    adds_up, measured = list[bool](), list[bool]()
+    """The picture of few frames leaves wrong slots that look sure; a frame received alone decides jointly, too.
+
+    What lies beyond the screen would show as slots: where its outline may reach that far, its ends are left out.
+    """
+    adds_up, measured, left_out = list[bool](), list[bool](), list[float]()
     measure_again = TrackedScreen.measure_again
 
     def decoded(*given: Any, **how: bool) -> Reception:
@@ -71,6 +74,8 @@ def test_frames_that_decide_picture_and_slots_together_are_measured_twice(
 
     def noted(scene: TrackedScreen, views: Any, known: Any, doubtful: list[bool]) -> None:
         measured.append(all(doubtful))
+        rows = np.ptp(scene.corners[:, 1]) - scene.pose.map.inside[10, 0].sum()
+        left_out.append(rows / views[0].acquisition.clock.rows_per_slot)
         measure_again(scene, views, known, doubtful)
 
     monkeypatch.setattr("rxcli.receiver.clip.receiver.decode", decoded)
@@ -80,6 +85,7 @@ def test_frames_that_decide_picture_and_slots_together_are_measured_twice(
     is_joint = exposure_slots > 1.7
     assert set(adds_up) == {not is_joint}
     assert measured == [True] * (1 + is_joint)
+    assert left_out == pytest.approx([6.0 * is_joint] * len(left_out), abs=1.2)
 
 
 @pytest.fixture(scope="module")

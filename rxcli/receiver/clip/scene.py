@@ -45,7 +45,10 @@ class TrackedScreen:
         self._black_level = model.black_level
         column_px = float(np.linalg.norm(corners[1] - corners[0])) / acquisition.screen.columns
         self._n_strips = min(plane.strips_per_column(column_px), SETTINGS.max_strips)
-        outlines = self._outlines(frame, corners)
+        outlines, self._n_end_rows = self._outlines(frame, corners), SETTINGS.end_rows
+        if decides_jointly(acquisition.clock):
+            self._n_end_rows = round(SETTINGS.end_slots * acquisition.clock.rows_per_slot)
+            outlines = replace(outlines, inside=_without_ends(outlines.inside, self._n_end_rows))
         strips = tracked.map_strips(outlines, frame, lambda coded: plane.tone_to_light(tone, coded))
         noise_floor = max(acquisition.profiles.noise_floor, MIN_VARIANCE * strips.pixels)
         #: Of a pixel.
@@ -250,7 +253,7 @@ class TrackedScreen:
     def _move(self, frame: Frame, found: Registration) -> None:
         """Move the strips to where the screen was found."""
         home, outlines = self._first_pose.map, self._outlines(frame, found.corners)
-        strips = tracked.moved_map(home, replace(outlines, inside=_without_ends(outlines.inside)))
+        strips = tracked.moved_map(home, replace(outlines, inside=_without_ends(outlines.inside, self._n_end_rows)))
         picture_row = geometry.rows_elsewhere(
             strips.rows, self._middles(found.corners), self._middles(self._first_pose.corners)
         )
@@ -408,9 +411,9 @@ def _header_contrast(columns: ColumnLight, rows: FloatArray, clock: Clock) -> fl
     return known_picture.header_contrast(columns, known_picture.row_positions(rows, clock), clock)
 
 
-def _without_ends(inside: BoolArray) -> BoolArray:
-    """(C, S, R) strips on the screen, without the rows at its ends, where the corners' error may reach."""
-    n, left = SETTINGS.end_rows, np.zeros_like(inside)
+def _without_ends(inside: BoolArray, n: int) -> BoolArray:
+    """(C, S, R) strips on the screen, without `n` rows at its ends, where the corners' error may reach."""
+    left = np.zeros_like(inside)
     left[..., n:-n] = inside[..., 2 * n :] & inside[..., : -2 * n]
     return left
 

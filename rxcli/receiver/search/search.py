@@ -178,7 +178,8 @@ class _Walk:
             camera, moved_slots = settle(
                 best.context, best.acquisition, best.reception, may_bend=self._proposer.may_bend
             )
-            if moved_slots < camera_settings.matters_slots:
+            is_enough = best.evidence > SETTINGS.plain_estimate or best.reception.is_long
+            if moved_slots < camera_settings.matters_slots and is_enough:
                 return best.with_camera(camera)
             hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
             if hypothesis is None:
@@ -224,7 +225,9 @@ class _Walk:
             is_near = self._siblings and -self._siblings[0][0] >= best.score - SETTINGS.reach
             if is_near and not (is_doubtful and (self._fresh or self._cameras is not None)):
                 return self._siblings, heapq.heappop(self._siblings)
-            if best.evidence > (SETTINGS.plain_estimate if is_estimated else SETTINGS.plain):
+            # A long exposure that no file states explains the light of a short one to some extent.
+            is_open = is_estimated and best.reception.is_long and self._proposer.cache.frame.metadata.exposure_s is None
+            if best.evidence > (SETTINGS.plain_estimate if is_estimated else SETTINGS.plain) and not is_open:
                 return None
         while self._cameras is not None and (not self._fresh or self._next_prior > -self._fresh[0][0]):
             try:
