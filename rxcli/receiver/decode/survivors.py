@@ -88,20 +88,10 @@ def detect(
     With `has_common_weights` the weights of all columns are the prior of each.
     """
     n_bursts, n_columns, n_slots = samples.n_bursts, samples.n_columns, samples.light.shape[0]
-    # A burst without a word in view is followed up to them: its paths would be as many as there may be.
-    reach = exposed_from(samples.exposure_slots, samples.light.shape[1]).shape[1] - 1
-    shows_words = (samples.valid[PREAMBLE_SLOTS - reach :] > 0).any(axis=(0, 1, 3))
-    followed: list[tuple[IntArray, _Words]] = []
-    w_log_prob, evidence = np.empty((shows_words.size, len(WEIGHTS))), np.empty(shows_words.size)
-    for shown, n_followed in ((shows_words, n_slots), (~shows_words, PREAMBLE_SLOTS)):
-        if (lanes := np.flatnonzero(shown)).size:
-            paths, steps, ends = _forward(part := _part(samples, lanes, n_followed), settings, is_free=False)
-            words = _backward(steps, ends, np.zeros_like(paths.log_likelihood))
-            followed.append((lanes, words))
-            w_log_prob[lanes] = _weight_log_prob(*(words or [_posterior(paths)])[0])
-            evidence[lanes] = _log_evidence(paths, part, settings)
+    paths, steps, ends = _forward(samples, settings, is_free=False)
+    words = _backward(steps, ends, np.zeros_like(paths.log_likelihood))
     # One weight for all bursts of a column; without the symbol that shows it, its paths may have been dropped.
-    shown, by_burst = shows_weight(samples)[..., None], w_log_prob.reshape(n_bursts, n_columns, -1)
+    shown, by_burst = shows_weight(samples)[..., None], _weight_log_prob(*words[0]).reshape(n_bursts, n_columns, -1)
     w_log_prob = (by_burst * (shown | ~shown.any(axis=0))).sum(axis=0)
     w_log_prob = w_log_prob - np.logaddexp.reduce(w_log_prob, axis=1, keepdims=True)
     common = np.log(weight_shares(w_log_prob)) if has_common_weights else 0.0
@@ -110,10 +100,10 @@ def detect(
     lit = np.empty((n_bursts, n_columns, n_slots), np.float32)
     index, log_prob = np.zeros(shape, np.int64), np.zeros(shape)
     bit_llr = np.full((*shape, 7), np.nan)
-    is_word = _counting(samples, reach)[1][PREAMBLE_SLOTS // SLOTS_PER_SYMBOL :, :, 0].T.reshape(shape)
+    is_word = _counting(samples)[1][PREAMBLE_SLOTS // SLOTS_PER_SYMBOL :, :, 0].T.reshape(shape)
     for weight in np.unique(w).tolist():
         columns = np.flatnonzero(w == weight)
-        posterior = _word_posteriors(followed, weight, shape)[:, columns]
+        posterior = _word_posteriors(words, weight, shape)[:, columns]
         posterior[~is_word[:, columns]] = 1 / posterior.shape[-1]
         lit[:, columns, :PREAMBLE_SLOTS] = preamble_slots(weight)
         lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(weight)).reshape(n_bursts, columns.size, -1)
@@ -121,19 +111,9 @@ def detect(
         log_prob[:, columns] = log_of_best(posterior, best)
         n_bits = bits_per_symbol(weight)
         bit_llr[:, columns, :, :n_bits] = llr_of_bits(posterior, n_bits)
-    evidence, header_llr = evidence.reshape(n_bursts, n_columns).sum(axis=0), np.zeros((n_bursts, n_columns))
+    evidence = _log_evidence(paths, samples, settings).reshape(n_bursts, n_columns).sum(axis=0)
+    header_llr = np.zeros((n_bursts, n_columns))
     return BurstPosteriors(w, w_log_prob, evidence, lit, index, log_prob, bit_llr, header_llr)
-
-
-def _part(samples: BurstSamples, lanes: IntArray, n_slots: int) -> BurstSamples:
-    """The first slots of some lanes, as those of one burst."""
-    if lanes.size == len(samples.log_scale) and n_slots == samples.light.shape[0]:
-        return samples
-    values = (samples.light, samples.noise, samples.valid, samples.neighbours)
-    light, noise, valid, neighbours = (each[:n_slots, :, lanes] for each in values)
-    of_lanes: dict[str, Any] = {"light": light, "noise": noise, "valid": valid, "neighbours": neighbours, "n_bursts": 1}
-    prior = None if samples.w_log_prior is None else samples.w_log_prior[lanes]
-    return replace(samples, **of_lanes, log_scale=samples.log_scale[lanes], w_log_prior=prior)
 
 
 def shows_weight(samples: BurstSamples) -> BoolArray:
@@ -198,7 +178,7 @@ def _forward(
     paths = _start(samples, settings)
     steps: list[_Step] = []
     ends: list[tuple[int, _Paths]] = []
-    n_counting, is_followed = _counting(samples, reach)
+    n_counting, is_followed = _counting(samples)
     for n in range(n_slots + reach):
         symbol, place = divmod(n, SLOTS_PER_SYMBOL) if n < n_slots else (0, n - n_slots)
         is_dimming = symbol == 1 and n < n_slots
@@ -230,7 +210,7 @@ def _forward(
     return paths, steps, ends
 
 
-def _counting(samples: BurstSamples, reach: int) -> tuple[IntArray, BoolArray]:
+def _counting(samples: BurstSamples) -> tuple[IntArray, BoolArray]:
     """What the samples in view leave of a path's past.
 
     Returns:
@@ -238,6 +218,7 @@ def _counting(samples: BurstSamples, reach: int) -> tuple[IntArray, BoolArray]:
         symbol is followed as a word. Of one that is mostly out of view there are as many words as there may be, so that
         it is followed as arbitrary slots.
     """
+    reach = exposed_from(samples.exposure_slots, samples.light.shape[1]).shape[1] - 1
     in_view: BoolArray = np.asarray((samples.valid > 0).any(axis=(1, 3)))
     n_slots, lanes = in_view.shape
     slot, after = np.arange(n_slots + reach)[:, None], np.full(lanes, n_slots + reach)
@@ -404,7 +385,9 @@ def _backward(steps: list[_Step], ends: list[tuple[int, _Paths]], after: FloatAr
     for n in range(len(steps) - 1, PREAMBLE_SLOTS - 1, -1):
         if pending and pending[-1][0] == n:
             paths = pending.pop()[1]
-            out.append(_posterior(paths, after))
+            posterior = paths.log_likelihood + after
+            posterior = np.exp(posterior - posterior.max(axis=1, keepdims=True))
+            out.append((posterior / posterior.sum(axis=1, keepdims=True), paths.w, paths.slots & _WORD))
         step = steps[n]
         gain = step.gain + after.take(np.maximum(step.target, 0) + after.shape[1] * np.arange(len(after))[:, None])
         gain[step.target < 0] = _NEVER
@@ -416,32 +399,24 @@ def _backward(steps: list[_Step], ends: list[tuple[int, _Paths]], after: FloatAr
     return out[::-1]
 
 
-def _posterior(paths: _Paths, after: FloatArray | float = 0.0) -> tuple[FloatArray, IntArray, IntArray]:
-    """Posterior, weight and word of paths, given the log-likelihood of what comes after."""
-    posterior = paths.log_likelihood + after
-    posterior = np.exp(posterior - posterior.max(axis=1, keepdims=True))
-    return posterior / posterior.sum(axis=1, keepdims=True), paths.w, paths.slots & _WORD
-
-
 def _weight_log_prob(posterior: FloatArray, w: IntArray, _: IntArray) -> FloatArray:
     """(lanes, 9) log probability of each weight."""
     by_weight = np.stack([(posterior * (w == weight)).sum(axis=1) for weight in WEIGHTS], axis=1)
     return np.asarray(np.log(np.maximum(by_weight, TINY)))
 
 
-def _word_posteriors(followed: list[tuple[IntArray, _Words]], weight: int, shape: tuple[int, int, int]) -> FloatArray:
+def _word_posteriors(words: _Words, weight: int, shape: tuple[int, int, int]) -> FloatArray:
     """(B, C, N, words) posterior of the words of a weight, uniform where no path of that weight is left."""
     place_of = np.full(_WORD + 1, -1)
     place_of[codebook(weight) @ (1 << np.arange(SLOTS_PER_SYMBOL - 1, -1, -1))] = np.arange(len(codebook(weight)))
-    out = np.full((shape[0] * shape[1], shape[2], len(codebook(weight))), 1 / len(codebook(weight)))
-    for lanes, words in followed:
-        lane = np.arange(lanes.size)[:, None]
-        for number, (posterior, w, word) in enumerate(words):
-            # A little for every word, since paths that were dropped are not impossible.
-            of_words = np.full((lanes.size, out.shape[-1]), TINY)
-            place = place_of[word]
-            np.add.at(of_words, (lane, np.maximum(place, 0)), np.where((w == weight) & (place >= 0), posterior, 0.0))
-            out[lanes, number] = of_words / of_words.sum(axis=1, keepdims=True)
+    out = np.empty((shape[0] * shape[1], shape[2], len(codebook(weight))))
+    lane = np.arange(len(out))[:, None]
+    for number, (posterior, w, word) in enumerate(words):
+        # A little for every word, since paths that were dropped are not impossible.
+        of_words = np.full((len(out), out.shape[-1]), TINY)
+        place = place_of[word]
+        np.add.at(of_words, (lane, np.maximum(place, 0)), np.where((w == weight) & (place >= 0), posterior, 0.0))
+        out[:, number] = of_words / of_words.sum(axis=1, keepdims=True)
     return out.reshape(*shape, -1)
 
 
