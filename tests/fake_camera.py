@@ -100,7 +100,7 @@ class FakeCamera:
 
     def ioctl(self, _descriptor: int, request: int, argument: Any) -> None:
         """Answer one call, whose argument is changed in place."""
-        data = bytearray(argument)
+        data, request = bytearray(argument), request & 0xFFFFFFFF
         _fail_unless(request in self._handlers, errno.ENOTTY)
         if self.gone_s is not None:
             _fail_unless(time.monotonic() - self.gone_s > self.faults.get("return_s", _NEVER), errno.ENODEV)

@@ -5,8 +5,9 @@ Colour is reduced to BT.601 luma, which is what a JPEG of the same picture would
 
 import io
 import logging
+import re
+import struct
 import warnings
-import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -63,48 +64,24 @@ def _colour_frame(path: Path, rgb: NDArray[Any], metadata: Metadata, weights: We
     return replace(_frame(path, luma_of(rgb, weights), metadata), colours=colours_of(rgb, weights))
 
 
+#: ISO 15948, table 11.1: samples of a pixel as they are decoded, by colour type; others may get an alpha.
+_PNG_SAMPLES = {0: 1, 4: 2}
+#: A chunk of EXIF, where it is no chance in compressed data.
+_PNG_EXIF = re.compile(rb"eXIf(?=II\*\0|MM\0\*)")
+
+
 def _read_png(data: bytes, path: Path) -> Frame:
-    """By OpenCV, which keeps 16-bit colour; checked before, because libpng writes complaints to stderr."""
-    import cv2
+    """By imagecodecs, which keeps 16 bits and passes over wrong check sums of what decides no pixel, with a warning."""
+    import imagecodecs
 
-    chunks = list(_png_chunks(data, path))
-    by_name = {name: chunk for name, chunk in chunks if name != b"IDAT"}
-    header = bytes(by_name.get(b"IHDR", b""))[8:-4].ljust(13, b"\0")
-    depth, samples = (2 if header[8] == 16 else 1), _PNG_SAMPLES.get(header[9], 4)
-    held = depth * (samples + (samples > 1))  # and the luma that is made of colour
-    check_size(path, int.from_bytes(header[:4]), int.from_bytes(header[4:8]), held, 2 * len(data))
-    plain = b"".join([data[:8], *(chunk for name, chunk in chunks if not name[0] & _ANCILLARY)])
-    try:
-        with quiet_libraries():
-            bgr = cv2.imdecode(np.frombuffer(plain, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        bgr = None
-    if bgr is None:
-        raise InputError(f"{path}: the PNG is damaged", "copy the file again")
-    rgb = bgr if bgr.ndim == 2 else bgr[:, :, 2::-1]
-    return _colour_frame(path, rgb, exif_metadata(bytes(by_name.get(b"eXIf", b""))[8:-4]))
-
-
-#: ISO 15948, table 11.1: samples of a pixel as OpenCV decodes it, by colour type; some may get an alpha.
-_PNG_SAMPLES = {0: 1, 2: 4, 3: 4, 4: 4, 6: 4}
-#: Bit of the first letter of chunks that decide no pixel (ISO 15948, section 5.4): texts, profiles, EXIF.
-_ANCILLARY = 0x20
-
-
-def _png_chunks(data: bytes, path: Path) -> Iterator[tuple[bytes, memoryview]]:
-    """Yield name and bytes of the chunks of a PNG (ISO 15948, section 5.3); check those which decide pixels."""
-    view, at = memoryview(data), 8
-    while True:
-        length, name = int.from_bytes(data[at : at + 4]), data[at + 4 : at + 8]
-        end = at + 12 + length
-        if end > len(data):
-            raise InputError(f"{path}: the PNG is cut after {len(data)} bytes", "copy the file again")
-        if not name[0] & _ANCILLARY and zlib.crc32(view[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end]):
-            raise InputError(f"{path}: the PNG is damaged at byte {at}", "copy the file again")
-        yield name, view[at:end]
-        if name == b"IEND":
-            return
-        at = end
+    width, height, depth, colour = struct.unpack_from(">IIBB", data.ljust(26, b"\0"), 16)
+    samples = _PNG_SAMPLES.get(colour, 4)
+    held = (2 if depth == 16 else 1) * (samples + (samples > 1))  # and the luma that is made of colour
+    check_size(path, width, height, held, 2 * len(data))
+    with damage_explained(f"{path}: the PNG is damaged or cut", "copy the file again"), quiet_libraries():
+        pixels = imagecodecs.png_decode(data)
+    exif = _PNG_EXIF.search(data)
+    return _colour_frame(path, pixels, exif_metadata(data[exif.end() :] if exif else b""))
 
 
 #: TIFF 6.0 and its supplements: compressions whose libraries write no more than they are given room for, and JPEG.
@@ -193,20 +170,13 @@ def _tiff_luma(pixels: NDArray[Any], path: Path) -> tuple[Luma, bool]:
         pixels = pixels.view(np.uint8) * np.uint8(255)
     if pixels.dtype in (np.uint8, np.uint16):
         return luma_of(pixels), False
-    if pixels.dtype == np.uint32:
-        return luma_of(_fewer_bits(pixels)), False
+    if pixels.dtype == np.uint32:  # software fills either end of 32 bits: take the upper 16 in use
+        bits = int(pixels.max(initial=0)).bit_length()
+        return luma_of((pixels >> max(bits - 16, 0) << max(16 - bits, 0)).astype(np.uint16)), False
     if pixels.dtype.kind != "f":
         raise InputError(f"{path}: TIFF samples of type {pixels.dtype}", "save it with 8 or 16 bits a sample")
     light = luma_of(_light_of(pixels))
     return np.rint(np.clip(light, 0, 1, out=light) * 65535).astype(np.uint16), True
-
-
-def _fewer_bits(pixels: NDArray[np.uint32]) -> NDArray[Any]:
-    """The upper 16 bits that are used, or the lower 8 where no more are: software fills either end of 32 bits."""
-    bits = int(pixels.max(initial=0)).bit_length()
-    if bits <= 8:
-        return pixels.astype(np.uint8)
-    return ((pixels >> (bits - 16)) if bits > 16 else (pixels << (16 - bits))).astype(np.uint16)
 
 
 def _light_of(pixels: NDArray[Any]) -> NDArray[np.float32]:

@@ -1,8 +1,8 @@
 """A live V4L2 camera in its own pixel formats, always the newest frame.
 
-The kernel interface is used directly. OpenCV hides why a camera cannot be opened, takes another pixel format unasked,
-and gives no times. FFmpeg's input (through PyAV) gives times, but sets neither exposure nor gain, lists modes to its
-log alone, and takes YUYV where 10 or 12 bits are asked for.
+The kernel is asked directly, in the structures of videodev2. OpenCV hides why a camera cannot be opened, takes another
+pixel format unasked, and gives no times. FFmpeg's input (through PyAV) gives times, but sets neither exposure nor gain,
+lists modes to its log alone, and takes YUYV where 10 or 12 bits are asked for.
 """
 
 import ctypes
@@ -21,15 +21,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import videodev2 as api
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError
-from rxcli.ingest import v4l2_abi as abi
 from rxcli.ingest.times import FrameTimes
 from rxcli.types import Frame, Metadata
 
 Luma = NDArray[np.uint8] | NDArray[np.uint16]
 
+_CAPTURE, _MAPPED = api.V4L2_BUF_TYPE_VIDEO_CAPTURE, api.V4L2_MEMORY_MMAP
+#: Requests of linux/videodev2.h that the package lacks, whose structures are numbers of 32 bits, and how many.
+_FRAME_SIZES, _N_SIZE, _FRAME_INTERVALS, _N_INTERVAL = 0xC02C564A, 11, 0xC034564B, 13
+#: Unit of the control of the exposure, seconds.
+_EXPOSURE_UNIT_S = 100e-6
 _N_BUFFERS = 4
 #: Minimum frame rate if none is requested, so that an aimed camera responds at once.
 _USUAL_FPS = 24.0
@@ -205,7 +210,7 @@ class Camera:
                     reason = f"{self._path}: the camera sent nothing for {self._settings.stall_s:g} s"
                     raise CameraLost(reason, "check its cable, or lower size and rate")
                 if luma is not None:
-                    yield self._frame(luma, buffer.seconds + buffer.microseconds * 1e-6)
+                    yield self._frame(luma, buffer.timestamp.tv_sec + buffer.timestamp.tv_usec * 1e-6)
                 elif silent_s > _POLL_S or self.counts.damaged > n_damaged:
                     yield None
 
@@ -225,62 +230,52 @@ class Camera:
         self._form = _set_format(self._descriptor, wanted, self._path)
         fps = _set_rate(self._descriptor, self._settings.fps or wanted.fps)
         self.mode = Mode(wanted.pixel_format, self._form.width, self._form.height, fps)
-        self.exposure_s = _set_exposure(self._descriptor, self._settings.exposure_s, self._path)
-        _set_gain(self._descriptor, self._settings.gain, self._path)
-        self._map_buffers()
-        ioctl(self._descriptor, abi.STREAMON, abi.BufferType(abi.BUF_TYPE_VIDEO_CAPTURE))
-        self.counts.connections += 1
-
-    def _map_buffers(self) -> None:
-        request = abi.RequestBuffers(count=_N_BUFFERS, type=abi.BUF_TYPE_VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
-        ioctl(self._descriptor, abi.REQBUFS, request)
+        self.exposure_s = _set_controls(self._descriptor, self._settings, self._path)
+        request = api.v4l2_requestbuffers(count=_N_BUFFERS, type=_CAPTURE, memory=_MAPPED)
+        ioctl(self._descriptor, api.VIDIOC_REQBUFS, request)
         for index in range(request.count):
             buffer = _buffer(index)
-            ioctl(self._descriptor, abi.QUERYBUF, buffer)
-            self._maps.append(mmap.mmap(self._descriptor, buffer.length, offset=buffer.offset))
+            ioctl(self._descriptor, api.VIDIOC_QUERYBUF, buffer)
+            self._maps.append(mmap.mmap(self._descriptor, buffer.length, offset=buffer.m.offset))
             self._give_back(buffer)
+        ioctl(self._descriptor, api.VIDIOC_STREAMON, ctypes.c_int(_CAPTURE))
+        self.counts.connections += 1
 
     # -- taking frames ------------------------------------------------------------------------------------------------
 
     def _newest(self) -> Any:
         """The newest whole capture; those before it go back to the driver unseen. None where none came for a while."""
         newest, n_captures = None, 0
-        while buffer := self._dequeue(0.0 if n_captures else _POLL_S):
+        while select.select([self._descriptor], [], [], 0.0 if n_captures else _POLL_S)[0]:
+            buffer = _buffer()
+            try:
+                ioctl(self._descriptor, api.VIDIOC_DQBUF, buffer)
+            except BlockingIOError:
+                time.sleep(_NO_DATA_SLEEP_S)
+                break
             n_captures += 1
             if self._sequence is not None:
                 self.counts.dropped += max(0, buffer.sequence - self._sequence - 1)
             self._sequence, self._came_s = buffer.sequence, time.monotonic()
-            if buffer.flags & abi.BUF_FLAG_ERROR:
+            if buffer.flags & api.V4L2_BUF_FLAG_ERROR:
                 self.counts.damaged += 1
                 self._give_back(buffer)
                 continue
-            if newest:
-                self._pass_over(newest)
+            self._pass_over(newest)
             newest = buffer
         # Where every buffer was filled, the driver had none for what came after: the newest is old.
-        if newest and n_captures == len(self._maps):
+        if n_captures == len(self._maps):
             self._pass_over(newest)
             return None
         return newest
 
-    def _dequeue(self, wait_s: float) -> Any:
-        """A filled buffer, None where there is none yet."""
-        if not select.select([self._descriptor], [], [], wait_s)[0]:
-            return None
-        buffer = _buffer(0)
-        try:
-            ioctl(self._descriptor, abi.DQBUF, buffer)
-        except BlockingIOError:
-            time.sleep(_NO_DATA_SLEEP_S)
-            return None
-        return buffer
-
     def _pass_over(self, buffer: Any) -> None:
-        self.counts.dropped += 1
-        self._give_back(buffer)
+        if buffer is not None:
+            self.counts.dropped += 1
+            self._give_back(buffer)
 
     def _give_back(self, buffer: Any) -> None:
-        ioctl(self._descriptor, abi.QBUF, _buffer(buffer.index))
+        ioctl(self._descriptor, api.VIDIOC_QBUF, _buffer(buffer.index))
 
     def _luma(self, buffer: Any) -> Luma | None:
         """A copy (height, width) of the luma in a buffer; None where it is damaged."""
@@ -303,7 +298,7 @@ class Camera:
     def _levels(self) -> tuple[float, float]:
         """Values of black and white."""
         pixels, form = PIXEL_FORMATS[self.mode.pixel_format], self._form
-        full = form.quantization == abi.QUANTIZATION_FULL_RANGE or form.colorspace == abi.COLORSPACE_JPEG
+        full = form.quantization == api.V4L2_QUANTIZATION_FULL_RANGE or form.colorspace == api.V4L2_COLORSPACE_JPEG
         return (16, 235) if pixels.ycbcr and not full else (0, pixels.white)
 
     def _frame(self, luma: Luma, own_s: float) -> Frame:
@@ -374,23 +369,23 @@ def _check_capture(descriptor: int, path: Path) -> str:
     Raises:
         InputError: the device is none that streams pictures.
     """
-    capability = abi.Capability()
-    if not _is_known(descriptor, abi.QUERYCAP, capability):
+    capability = api.v4l2_capability()
+    if not _is_known(descriptor, api.VIDIOC_QUERYCAP, capability):
         raise InputError(f"{path}: is no V4L2 device", "name a camera, such as /dev/video0")
-    has_own = capability.capabilities & abi.CAP_DEVICE_CAPS
+    has_own = capability.capabilities & api.V4L2_CAP_DEVICE_CAPS
     able = capability.device_caps if has_own else capability.capabilities
-    needed = abi.CAP_VIDEO_CAPTURE | abi.CAP_STREAMING
+    needed = api.V4L2_CAP_VIDEO_CAPTURE | api.V4L2_CAP_STREAMING
     if able & needed != needed:
         raise InputError(f"{path}: does not stream pictures", "name the camera's other /dev/video device")
-    return bytes(capability.card).decode("utf-8", "replace")
+    return bytes(capability.card).partition(b"\0")[0].decode("utf-8", "replace")
 
 
-def _is_known(descriptor: int, request: int, argument: ctypes.Structure, *refusals: int) -> bool:
-    """Make a system call; whether the driver knows it, and refuses it with none of some further error codes."""
+def _is_known(descriptor: int, request: int, argument: Any) -> bool:
+    """Make a system call; whether the driver knows it and does not refuse its argument."""
     try:
         ioctl(descriptor, request, argument)
     except OSError as error:
-        if error.errno in (errno.EINVAL, errno.ENOTTY, *refusals):
+        if error.errno in (errno.EINVAL, errno.ENOTTY, errno.EACCES, errno.ERANGE):
             return False
         raise
     return True
@@ -398,25 +393,29 @@ def _is_known(descriptor: int, request: int, argument: ctypes.Structure, *refusa
 
 def _modes(descriptor: int) -> Iterator[Mode]:
     """Modes of known pixel formats; of a range of sizes or rates the largest."""
-    for form in _enumerate(descriptor, abi.ENUM_FMT, lambda i: abi.FormatDescription(i, abi.BUF_TYPE_VIDEO_CAPTURE)):
-        code, name = form.pixelformat, abi.fourcc_name(form.pixelformat)
-        sizes = partial(abi.FrameSize, pixel_format=code)
-        for size in _enumerate(descriptor, abi.ENUM_FRAMESIZES, sizes) if name in PIXEL_FORMATS else ():
-            places = (0, 1) if size.type == abi.FRAME_SIZE_DISCRETE else (1, 4)
-            width, height = (size.size[place] for place in places)
-            intervals = partial(abi.FrameInterval, pixel_format=code, width=width, height=height)
-            found = [item.interval for item in _enumerate(descriptor, abi.ENUM_FRAMEINTERVALS, intervals)]
-            rates = [interval[1] / interval[0] for interval in found if interval[0]]
+    for form in _enumerate(descriptor, api.VIDIOC_ENUM_FMT, api.v4l2_fmtdesc, _CAPTURE):
+        code, name = form.pixelformat, _name_of(form.pixelformat)
+        sizes = _enumerate(descriptor, _FRAME_SIZES, ctypes.c_uint32 * _N_SIZE, code)
+        for _, _, kind, *sides in sizes if name in PIXEL_FORMATS else ():
+            # Width and height; of a range the least, largest and step of either.
+            width, height = sides[:2] if kind == api.V4L2_FRMSIZE_TYPE_DISCRETE else sides[1:5:3]
+            intervals = _enumerate(descriptor, _FRAME_INTERVALS, ctypes.c_uint32 * _N_INTERVAL, code, width, height)
+            rates = (denominator / numerator for *_, numerator, denominator in (i[5:7] for i in intervals) if numerator)
             yield Mode(name, width, height, max(rates, default=0.0))
 
 
-def _enumerate(descriptor: int, request: int, structure: Callable[[int], Any]) -> Iterator[Any]:
-    """Enumerate entries of the driver until EINVAL; empty if it cannot enumerate."""
+def _enumerate(descriptor: int, request: int, structure: Callable[..., Any], *fields: int) -> Iterator[Any]:
+    """Enumerate entries of the driver until EINVAL; empty if it cannot enumerate. `fields` follow the index."""
     for index in range(1000):
-        item = structure(index)
+        item = structure(index, *fields)
         if not _is_known(descriptor, request, item):
             return
         yield item
+
+
+def _name_of(code: int) -> str:
+    """Name of a pixel format code, without the padding to four letters."""
+    return code.to_bytes(4, "little").decode("latin-1").rstrip()
 
 
 def _merit(mode: Mode, fps: float | None = None) -> tuple[bool, int, int]:
@@ -444,60 +443,54 @@ def _choose(modes: list[Mode], settings: CameraSettings, path: Path) -> Mode:
 
 def _set_format(descriptor: int, mode: Mode, path: Path) -> Any:
     """Set the format of a mode; returns the one in effect, with the size and the bytes of a row."""
-    code = abi.fourcc(mode.pixel_format)
-    form = abi.Format(
-        type=abi.BUF_TYPE_VIDEO_CAPTURE, width=mode.width, height=mode.height, pixelformat=code, field=abi.FIELD_NONE
-    )
-    ioctl(descriptor, abi.S_FMT, form)
-    if form.pixelformat != code:  # a driver may answer with the nearest that it has
-        got = abi.fourcc_name(form.pixelformat)
-        raise InputError(f"{path}: gives {got} instead of {mode.pixel_format}", "ask for another --format")
-    return form
+    code = api.v4l2_fourcc(*mode.pixel_format.ljust(4))
+    form = api.v4l2_format(type=_CAPTURE)
+    form.fmt.pix = api.v4l2_pix_format(mode.width, mode.height, code, api.V4L2_FIELD_NONE)
+    ioctl(descriptor, api.VIDIOC_S_FMT, form)
+    if (got := form.fmt.pix.pixelformat) != code:  # a driver may answer with the nearest that it has
+        raise InputError(f"{path}: gives {_name_of(got)} instead of {mode.pixel_format}", "ask for another --format")
+    return form.fmt.pix
 
 
 def _set_rate(descriptor: int, fps: float) -> float:
     """Ask for a frame rate; returns the actual one, 0 if it is not reported."""
-    parameters = abi.StreamParameters(type=abi.BUF_TYPE_VIDEO_CAPTURE)
+    parameters = api.v4l2_streamparm(type=_CAPTURE)
+    interval = parameters.parm.capture.timeperframe
     if fps > 0:
-        parameters.numerator, parameters.denominator = 1000, round(1000 * fps)
-    if not _is_known(descriptor, abi.S_PARM, parameters) or not parameters.numerator:
+        interval.numerator, interval.denominator = 1000, round(1000 * fps)
+    if not _is_known(descriptor, api.VIDIOC_S_PARM, parameters) or not interval.numerator:
         return 0.0
-    return float(parameters.denominator / parameters.numerator)
+    return float(interval.denominator / interval.numerator)
 
 
-def _set_exposure(descriptor: int, exposure_s: float | None, path: Path) -> float | None:
-    """Fix the exposure, the shortest if none is requested; returns the actual one, or None.
+def _set_controls(descriptor: int, settings: CameraSettings, path: Path) -> float | None:
+    """Fix the exposure, the shortest if none is requested, and a requested gain; returns the actual exposure, or None.
 
     Raises:
         InputError: one is asked for and the camera has no such control.
     """
-    _set(descriptor, abi.CID_EXPOSURE_AUTO, abi.EXPOSURE_MANUAL)
-    _set(descriptor, abi.CID_EXPOSURE_AUTO_PRIORITY, 0)  # else the camera lowers its rate in the dark
-    units = 0 if exposure_s is None else round(exposure_s / abi.EXPOSURE_UNIT_S)
-    taken = _set(descriptor, abi.CID_EXPOSURE_ABSOLUTE, units)
-    if taken is None and exposure_s is not None:
+    _set(descriptor, api.V4L2_CID_EXPOSURE_AUTO, api.V4L2_EXPOSURE_MANUAL)
+    _set(descriptor, api.V4L2_CID_EXPOSURE_AUTO_PRIORITY, 0)  # else the camera lowers its rate in the dark
+    units = _set(descriptor, api.V4L2_CID_EXPOSURE_ABSOLUTE, round((settings.exposure_s or 0.0) / _EXPOSURE_UNIT_S))
+    if units is None and settings.exposure_s is not None:
         raise InputError(f"{path}: the camera has no exposure control", "leave --exposure out")
-    return None if taken is None else taken * abi.EXPOSURE_UNIT_S
-
-
-def _set_gain(descriptor: int, gain: int | None, path: Path) -> None:
-    if gain is None:
-        return
-    _set(descriptor, abi.CID_AUTOGAIN, 0)
-    if _set(descriptor, abi.CID_GAIN, gain) is None:
-        raise InputError(f"{path}: the camera has no gain control", "leave --gain out")
+    if settings.gain is not None:
+        _set(descriptor, api.V4L2_CID_AUTOGAIN, 0)
+        if _set(descriptor, api.V4L2_CID_GAIN, settings.gain) is None:
+            raise InputError(f"{path}: the camera has no gain control", "leave --gain out")
+    return None if units is None else units * _EXPOSURE_UNIT_S
 
 
 def _set(descriptor: int, control: int, value: int) -> int | None:
     """Set a control to the nearest value that it can have; the value in effect, None where there is no such control."""
-    limits, refusals = abi.ControlRange(id=control), (errno.EACCES, errno.ERANGE)
-    if not _is_known(descriptor, abi.QUERYCTRL, limits, *refusals):
+    limits = api.v4l2_queryctrl(id=control)
+    if not _is_known(descriptor, api.VIDIOC_QUERYCTRL, limits):
         return None
-    state = abi.Control(control, min(max(value, limits.minimum), limits.maximum))
-    able = not limits.flags & (abi.CTRL_FLAG_DISABLED | abi.CTRL_FLAG_READ_ONLY)
-    known = able and all(_is_known(descriptor, call, state, *refusals) for call in (abi.S_CTRL, abi.G_CTRL))
+    state = api.v4l2_control(control, min(max(value, limits.minimum), limits.maximum))
+    able = not limits.flags & (api.V4L2_CTRL_FLAG_DISABLED | api.V4L2_CTRL_FLAG_READ_ONLY)
+    known = able and all(_is_known(descriptor, call, state) for call in (api.VIDIOC_S_CTRL, api.VIDIOC_G_CTRL))
     return int(state.value) if known else None
 
 
-def _buffer(index: int) -> ctypes.Structure:
-    return abi.Buffer(index=index, type=abi.BUF_TYPE_VIDEO_CAPTURE, memory=abi.MEMORY_MMAP)
+def _buffer(index: int = 0) -> Any:
+    return api.v4l2_buffer(index=index, type=_CAPTURE, memory=_MAPPED)
