@@ -9,7 +9,7 @@ import numpy as np
 
 from rxcli.numerics import peak_offset
 from rxcli.profiles import ScreenProfile
-from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel
 from rxcli.receiver.decode import detect
 from rxcli.receiver.frame.acquisition import Acquisition, distinct_screens
@@ -24,7 +24,7 @@ from rxcli.receiver.search.cameras import UNKNOWN, cameras_by_slots, estimated_c
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import decode, detected_on, initial_pass, llr_of, slots_of_any_kind
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import Clock, Float32Array, FrameSoftBits
+from rxcli.types import Clock, Float32Array, FloatArray, FrameSoftBits
 
 #: Passes made over cut packets: all columns with light.
 _SKIP = frozenset({"dark_columns"})
@@ -213,24 +213,41 @@ def _candidates(slots: _Slots) -> Iterator[_Candidate]:
         of_slots = channel.metrics_of(llr_of(slots.lit), initial.model.exposure.isi_memory)
         initial = replace(initial, metrics=(initial.metrics + of_slots) / 2)
 
-        # Packets of any length: longer by a symbol than what is in view, as the first one may begin before the picture.
-        longer = clock.packet_slots + SLOTS_PER_SYMBOL
-        without = [_begun(initial, PREAMBLE_SLOTS + phase, longer) for phase in range(SLOTS_PER_SYMBOL)]
-        starts: dict[int, tuple[float, bool]] = {}
+        weights = [np.full(len(initial.metrics), w / SLOTS_PER_SYMBOL) for w in WEIGHTS]
+        free = np.log(len(WEIGHTS)) + [detect.free_log_evidence(initial.metrics, w) for w in weights]
         for phase in range(SLOTS_PER_SYMBOL):
-            for first_slot in range(phase, n, SLOTS_PER_SYMBOL):
-                # The last slot of the clock lies beyond the picture.
-                if first_slot < PREAMBLE_SLOTS or first_slot + clock.n_slots > n + 1:
-                    starts[first_slot] = evidence.fit(_begun(initial, first_slot, n)) - SETTINGS.cut_start, False
-            if PREAMBLE_SLOTS + phase + clock.n_slots <= n + 1:
-                starts[PREAMBLE_SLOTS + phase] = evidence.fit(without[phase]), True
-        for first_slot, (fit, is_open) in starts.items():
-            yield _Candidate(context, replace(acquisition, clock=_started(clock, first_slot, n)), fit, is_open)
+            first_slots = range(phase, n, SLOTS_PER_SYMBOL)
+            # A header is in view, at least in part; the last slot of the clock lies beyond the picture.
+            shown = [slot for slot in first_slots if slot < PREAMBLE_SLOTS or slot + clock.n_slots > n + 1]
+            shown.sort(key=lambda first_slot: -_header_fit(initial, first_slot, n))
+            starts = [(slot, _fit(initial, free, slot, n) - SETTINGS.cut_start) for slot in shown[:2]]
+            if len(shown) < len(first_slots):
+                # Packets of any length: longer by a symbol than what is in view, as the first may begin before it.
+                longer = clock.packet_slots + SLOTS_PER_SYMBOL
+                starts.append((PREAMBLE_SLOTS + phase, _fit(initial, free, PREAMBLE_SLOTS + phase, longer)))
+            for first_slot, fit in starts:
+                moved = replace(acquisition, clock=_started(clock, first_slot, n))
+                yield _Candidate(context, moved, fit, is_open=first_slot not in shown)
 
 
-def _begun(initial: Reception, first_slot: int, packet_slots: int) -> Reception:
-    """The initial pass with packets of some length that begin elsewhere."""
-    return detected_on(initial, _started(initial.clock, first_slot, packet_slots))
+def _header_fit(initial: Reception, first_slot: int, packet_slots: int) -> float:
+    """How well the header fits where packets of some length begin elsewhere."""
+    bursts = channel.by_burst(initial.metrics, _started(initial.clock, first_slot, packet_slots))
+    return float(np.maximum(detect.header_llr(bursts).sum(axis=0), SETTINGS.worst_fit).sum())
+
+
+def _fit(initial: Reception, free: FloatArray, first_slot: int, packet_slots: int) -> float:
+    """See `evidence.fit`: with packets of some length that begin elsewhere.
+
+    Args:
+        initial: the initial pass.
+        free: (9, C) log evidence of arbitrary slots by the weight of a column.
+        first_slot: slot of a packet that the clock begins with.
+        packet_slots: length of the packets.
+    """
+    begun = detected_on(initial, _started(initial.clock, first_slot, packet_slots))
+    own = np.take_along_axis(free, begun.posteriors.w[None] - 1, axis=0)[0]
+    return evidence.fit(replace(begun, free_log_evidence=own))
 
 
 def _started(clock: Clock, first_slot: int, packet_slots: int) -> Clock:
