@@ -52,7 +52,7 @@ class SurvivorSettings(msgspec.Struct, frozen=True):
 
     #: Most paths that are kept, and log-likelihood below the best path at which one is dropped.
     max_paths: int = 24
-    max_lag: float = 25.0
+    max_lag: float = 18.0
     #: Effective number of independent samples per slot and strip.
     information: float = 0.5
     #: Change of the picture per slot, its deviation at the start, both relative; degrees of freedom of its errors.
