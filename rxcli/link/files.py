@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.link import ldpc, softbits
-from rxcli.link.beacons import gathered, is_likely, read_words
+from rxcli.link.beacons import gathered, read_words
 from rxcli.link.formats import (
     Announcement,
     Container,
@@ -39,12 +40,12 @@ _RETRY_GAIN = 0.02
 _LEARN_FROM, _PROBES, _FEW = 16, 8, 0.25
 #: Minimum log-likelihood of a decoded block, relative to the received information.
 _MIN_LIKELIHOOD = 0.5
-#: Bytes of bursts that wait for an announcement, and bursts that may be reassigned to a new object.
-_MAX_WAITING, _MAX_RECENT = 32 << 20, 96
+#: Bytes of bursts that wait for an announcement.
+_MAX_OPEN = 32 << 20
 #: Largest accepted file, bytes.
 MAX_OBJECT_BYTES = 16 << 20
-#: Bytes of a file's state beside its sums, and maximum numbers of stored timelines and notes.
-_STATE_BYTES, _MAX_TIMELINES, _MAX_NOTES = 1 << 14, 16, 20
+#: Bytes of a file's state beside its sums, and maximum number of notes.
+_STATE_BYTES, _MAX_NOTES = 1 << 14, 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,23 +270,22 @@ def _is_likely(layout: FileLayout, information_bits: NDArray[np.uint8], llr: NDA
 class _Timeline:
     """Mapping from burst numbers of an epoch to those of an object, and from the picture's columns to the screen's."""
 
-    epoch: int
     offset: int
     placement: Placement
     file: FileState
-    #: The first and the last burst with a matching announcement.
+    #: The first burst that is certainly of the file, and the last one with a matching announcement.
     since: int
     until: int
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
     """A burst that may be an announcement, under a placement of its columns."""
 
     epoch: int
     number: int
     placement: Placement
-    buffer: Float32 = field(default_factory=lambda: np.zeros(0, np.float32))
+    buffer: Float32
 
 
 class FileSearch:
@@ -302,21 +302,18 @@ class FileSearch:
         self._columns, self._payload_symbols = columns, payload_symbols
         self._layout = announcement_layout(columns, payload_symbols)
         self.files: dict[tuple[int, int, int, int], FileState] = {}
-        #: Timelines of every epoch, latest last.
-        self._timelines: dict[int, list[_Timeline]] = {}
-        self._waiting: list[_Burst] = []
-        #: Recent bursts with the timeline by which they were added.
-        self._recent: list[tuple[_Timeline, _Burst]] = []
+        #: Latest timeline of every epoch.
+        self._timelines: dict[int, _Timeline] = {}
+        #: Bursts that no announcement has settled yet: what follows the last one of a file may be of the next file.
+        self._open: list[_Burst] = []
         self._candidates: list[_Candidate] = []
         self._n_shifted = 0
-        #: Bursts of the current frame.
-        self._fresh: list[tuple[_Timeline, _Burst]] = []
         #: Sentences about refused files.
         self.notes: list[str] = []
 
     def placement(self, epoch: int) -> Placement | None:
         """Placement of the columns by the announcements of this epoch; None if there were none."""
-        return self._timelines[epoch][-1].placement if epoch in self._timelines else None
+        return self._timelines[epoch].placement if epoch in self._timelines else None
 
     def add(
         self, soft: FrameSoftBits, settled: Placement | None, at_last: bool = False
@@ -326,50 +323,42 @@ class FileSearch:
         for number, llr in zip(soft.burst, soft.llr, strict=True):
             groups = [[settled]] if settled else possible_placements(llr)[: 2 + (self._n_shifted < _MAX_SHIFTED)]
             self._n_shifted += len(groups) > 2
-            for placement in (placement for group in groups for placement in group):
-                self._look_for_announcement(_Candidate(soft.epoch, int(number), placement), placement.of(llr))
+            for placement in chain(*groups):
+                self._look_for_announcement(soft.epoch, int(number), placement, placement.of(llr))
         # These have too few copies to decide. A batch costs little more than a single attempt.
         if len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
             self._try_gathered()
-        quantised = ldpc.quantised(soft.llr)
-        for number, llr in zip(soft.burst, quantised, strict=True):
-            self._enter(_Burst(soft.epoch, int(number), llr), soft.time_s)
-        self._flush_entered()
+        bursts = [
+            _Burst(soft.epoch, *burst) for burst in zip(soft.burst.tolist(), ldpc.quantised(soft.llr), strict=True)
+        ]
+        self._open += bursts
+        del self._open[: -max(1, _MAX_OPEN // max(bursts[0].llr.size, 1))]
+        line = self._timelines.get(soft.epoch)
+        if line is not None:
+            file = line.file
+            file.first_time_s = soft.time_s if file.first_time_s is None else file.first_time_s
+            file.last_time_s = soft.time_s
+            file.frames_waited += 1
+            _enter_bursts(line, [burst for burst in bursts if burst.number >= line.since], 1)
         return self._complete(at_last)
 
     def finish(self) -> list[tuple[FileState, Container]]:
         """Decode the remaining announcements and blocks."""
         self._try_gathered()
-        self._flush_entered()
         return self._complete(at_last=True)
 
     # -- announcements -------------------------------------------------------------------------------------------------
 
-    def _look_for_announcement(self, candidate: _Candidate, llr: Float32) -> None:
-        candidate.buffer = gathered(self._layout, llr)
-        similarity = same_bits_llr(candidate.buffer, float(surprise(llr).sum(dtype=np.float64)))
-        if similarity < MIN_SIMILARITY:
+    def _look_for_announcement(self, epoch: int, number: int, placement: Placement, llr: Float32) -> None:
+        buffer = gathered(self._layout, llr)
+        similarity = same_bits_llr(buffer, float(surprise(llr).sum(dtype=np.float64)))
+        if similarity < MIN_SIMILARITY or information(buffer).sum() < TRY_FROM * self._layout.code.k:
             return
-        if information(candidate.buffer).sum() < TRY_FROM * self._layout.code.k:
-            return
+        candidate = _Candidate(epoch, number, placement, buffer)
         if similarity > -MIN_SIMILARITY:
-            if not self._is_expected(candidate):
-                self._try_candidates([candidate])
-        elif candidate.epoch not in self._timelines:
+            self._try_candidates([candidate])
+        elif epoch not in self._timelines:
             self._candidates.append(candidate)
-
-    def _is_expected(self, candidate: _Candidate) -> bool:
-        """Whether a burst is the announcement that its timeline predicts."""
-        line = _line_of(self._timelines.get(candidate.epoch, []), candidate.number)
-        burst = 0 if line is None else candidate.number + line.offset
-        if line is None or burst % ANNOUNCEMENT_PERIOD or burst >= 1 << 32:
-            return False
-        coded = replace(line.file.announcement, burst=burst).protected()
-        bits = np.unpackbits(np.frombuffer(coded, np.uint8))
-        if line.file.dropped or not is_likely(self._layout, bits, candidate.buffer):
-            return False
-        line.until = max(line.until, candidate.number)
-        return True
 
     def _try_gathered(self) -> None:
         candidates, self._candidates = self._candidates, []
@@ -391,11 +380,18 @@ class FileSearch:
             if known is None:
                 return
         offset, number, placement = announcement.burst - candidate.number, candidate.number, candidate.placement
-        lines = self._timelines.setdefault(candidate.epoch, [])
-        if not lines or (lines[-1].offset, lines[-1].file, lines[-1].placement) != (offset, known, placement):
-            lines.append(_Timeline(candidate.epoch, offset, placement, known, number, number))
-            self._claim(lines)
-            del lines[:-_MAX_TIMELINES]
+        line = self._timelines.get(candidate.epoch)
+        if line is None or (line.offset, line.file, line.placement) != (offset, known, placement):
+            # A change of files is certain where a file begins; later only its announcements are.
+            begins = line is None or -offset > line.until
+            before, line = line, _Timeline(offset, placement, known, -offset if begins else number, number)
+            self._timelines[candidate.epoch] = line
+            doubtful = [b for b in self._open if b.epoch == candidate.epoch and b.number >= -offset]
+            if before is not None:
+                _enter_bursts(before, [b for b in doubtful if b.number >= before.since], -1)
+            _enter_bursts(line, [b for b in doubtful if b.number >= line.since], 1)
+        line.until = max(line.until, number)
+        self._open = [b for b in self._open if b.epoch != candidate.epoch or b.number > number]
 
     def _begun(self, announcement: Announcement) -> FileState | None:
         """Start a new file; None if it is too long."""
@@ -420,49 +416,6 @@ class FileSearch:
         if sentence not in self.notes and len(self.notes) < _MAX_NOTES:
             self.notes.append(sentence)
 
-    def _claim(self, lines: list[_Timeline]) -> None:
-        """Assign waiting bursts, and some of other files, to the newest timeline."""
-        line = lines[-1]
-        waiting, self._waiting = self._waiting, []
-        mine: list[_Burst] = []
-        for burst in waiting:
-            (mine if burst.epoch == line.epoch and _line_of(lines, burst.number) is line else self._waiting).append(
-                burst
-            )
-        recent, self._recent = self._recent, []
-        for before, burst in recent:
-            if burst.epoch != line.epoch or _line_of(lines, burst.number) is before:
-                self._recent.append((before, burst))
-                continue
-            _enter_bursts(before, [burst], -1)
-            if _line_of(lines, burst.number) is line:
-                mine.append(burst)
-                self._recent.append((line, burst))
-        _enter_bursts(line, mine, 1)
-
-    # -- data ----------------------------------------------------------------------------------------------------------
-
-    def _enter(self, burst: _Burst, time_s: float) -> None:
-        line = _line_of(self._timelines.get(burst.epoch, []), burst.number)
-        if line is None:
-            self._waiting.append(burst)
-            capacity = max(1, _MAX_WAITING // max(burst.llr.size, 1))
-            del self._waiting[:-capacity]
-            return
-        file = line.file
-        file.first_time_s = time_s if file.first_time_s is None else file.first_time_s
-        file.last_time_s = time_s
-        self._fresh.append((line, burst))
-
-    def _flush_entered(self) -> None:
-        """Add all bursts of a frame together."""
-        fresh, self._fresh = self._fresh, []
-        for line in dict.fromkeys(line for line, _ in fresh):
-            _enter_bursts(line, [burst for owner, burst in fresh if owner is line], 1)
-            line.file.frames_waited += 1
-        self._recent += fresh
-        del self._recent[:-_MAX_RECENT]
-
     def _complete(self, at_last: bool) -> list[tuple[FileState, Container]]:
         """Read the blocks that are ready, and return the files that are whole by now."""
         found = []
@@ -480,18 +433,6 @@ class FileSearch:
                     f"a file of {file.layout.length} bytes is complete but not what was sent: {file.failure}"
                 )
         return found
-
-
-def _line_of(lines: list[_Timeline], number: int) -> _Timeline | None:
-    """The latest timeline that a burst fits; None if there is none or two fit."""
-    for place in reversed(range(len(lines))):
-        line, earlier = lines[place], lines[place - 1] if place else None
-        if number + line.offset < 0 or (earlier is not None and number <= earlier.until):
-            continue
-        # A change of files is certain where a file begins; later only its announcements are.
-        begins = earlier is None or -line.offset > earlier.until
-        return line if begins or number >= line.since else None
-    return None
 
 
 def _enter_bursts(line: _Timeline, bursts: list[_Burst], sign: int) -> None:
