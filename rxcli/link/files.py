@@ -35,9 +35,8 @@ _BLOCKS_AT_ONCE, _SHARE_AT_ONCE, _PATIENT_FRAMES = 32, 0.5, 30
 _ITERATIONS = 25
 #: Increase of information before the next attempt on a block, relative to its bits.
 _RETRY_GAIN = 0.02
-#: Files of at least this many blocks estimate the required information from this many first ones; and the share of
-#: decoded blocks in a batch below which the required information is raised.
-_LEARN_FROM, _PROBES, _FEW = 16, 8, 0.25
+#: Share of decoded blocks in a batch below which the required information is raised.
+_FEW = 0.25
 #: Minimum log-likelihood of a decoded block, relative to the received information.
 _MIN_LIKELIHOOD = 0.5
 #: Bytes of bursts that wait for an announcement.
@@ -70,8 +69,6 @@ class FileState:
     known: NDArray[np.float64]
     threshold: NDArray[np.float64]
     blocks: dict[int, bytes] = field(default_factory=dict)
-    #: Information at which blocks were decoded, relative to their bits.
-    read_at: list[float] = field(default_factory=list)
     #: Minimum information for decoding any block, relative to its bits.
     min_information: float = 0.0
     done: bool = False
@@ -159,20 +156,11 @@ class FileState:
     def _thresholds(self, at_last: bool) -> NDArray[np.float64]:
         if at_last:
             return self.threshold - 2 * _RETRY_GAIN * self.layout.code.k
-        required = self.min_information
-        if self.layout.n_blocks >= _LEARN_FROM and len(self.read_at) >= _PROBES:
-            required = max(required, float(np.median(self.read_at[-4 * _BLOCKS_AT_ONCE :])) - _RETRY_GAIN)
-        return np.maximum(self.threshold, required * self.layout.code.k)
+        return np.maximum(self.threshold, self.min_information * self.layout.code.k)
 
     def read(self, which: NDArray[np.int64]) -> None:
-        """Decode blocks; if the first ones fail, the rest waits."""
+        """Decode blocks."""
         self.frames_waited = 0
-        if self.layout.n_blocks >= _LEARN_FROM and not self.read_at:
-            ordered = which[np.argsort(-self.known[which])]
-            self._read_batch(ordered[:_PROBES])
-            which = np.sort(ordered[_PROBES:])
-            if not self.read_at:
-                return
         for start in range(0, which.size, _BLOCKS_AT_ONCE):
             self._read_batch(which[start : start + _BLOCKS_AT_ONCE])
 
@@ -194,7 +182,6 @@ class FileState:
             return good
 
         read = ldpc.decode(layout.code, llr, accepted, _ITERATIONS)
-        self.read_at += (self.known[which[read]] / layout.code.k).tolist()
         if read.mean() < _FEW:
             self.min_information = float(self.known[which].mean()) / layout.code.k + _RETRY_GAIN
         failed = which[~read]
@@ -315,9 +302,7 @@ class FileSearch:
         """Placement of the columns by the announcements of this epoch; None if there were none."""
         return self._timelines[epoch].placement if epoch in self._timelines else None
 
-    def add(
-        self, soft: FrameSoftBits, settled: Placement | None, at_last: bool = False
-    ) -> list[tuple[FileState, Container]]:
+    def add(self, soft: FrameSoftBits, settled: Placement | None) -> list[tuple[FileState, Container]]:
         """Add bursts and return the files that they complete; `settled` is the placement of their columns if known."""
         settled = settled or self.placement(soft.epoch)
         for number, llr in zip(soft.burst, soft.llr, strict=True):
@@ -340,7 +325,7 @@ class FileSearch:
             file.last_time_s = soft.time_s
             file.frames_waited += 1
             _enter_bursts(line, [burst for burst in bursts if burst.number >= line.since], 1)
-        return self._complete(at_last)
+        return self._complete(at_last=False)
 
     def finish(self) -> list[tuple[FileState, Container]]:
         """Decode the remaining announcements and blocks."""
