@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from operator import itemgetter
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,11 @@ from rxcli.link.placement import Placement, possible_placements
 from rxcli.link.softbits import LN2, MIN_SIMILARITY, TRY_FROM, Float32, log_likelihood, same_bits_llr, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
+_T = TypeVar("_T")
 #: Increase of information before the next attempt to decode a beacon, and the upper limit; relative to its bits.
 _RETRY_GAIN, _TRY_UP_TO = 0.08, 2.5
 #: Bits that must be observed, relative to the beacon's: the others may be known.
 _MIN_OBSERVED = 0.5
-_ITERATIONS = 40
 #: `MIN_SIMILARITY` of bits that a message sends twice within a burst: one symbol may be misread.
 MIN_REPEATED = -30.0
 #: Log-likelihood ratio above which bursts are copies of each other.
@@ -220,9 +221,8 @@ class BeaconSearch:
             return
         candidate.tried[key] = float(bits[which].max())
         self._fruitless[len(candidate.total)] += 1
-        words = read_words(layout, buffers[which], known=known.of(which))
-        for place, word in zip(possible[which].tolist(), words, strict=True):
-            found = None if word is None else unprotect_beacon(word)
+        words = read_beacons(layout, buffers[which], known.of(which))
+        for place, found in zip(possible[which].tolist(), words, strict=True):
             if found is not None:
                 yield placements[place], found
 
@@ -232,30 +232,43 @@ def gathered(layout: BeaconLayout, llr: Float32) -> Float32:
     return np.bincount(layout.places.ravel(), llr.ravel(), layout.n_bits).astype(np.float32)
 
 
+def read_beacons(
+    layout: BeaconLayout, buffers: Float32, known: KnownBits | None = None
+) -> list[tuple[MessageKind, bytes] | None]:
+    """Kind and message of the beacons in buffers (n, n_bits) of a layout, or None."""
+    return read_words(layout.code, buffers, lambda _, word: unprotect_beacon(word), known)
+
+
 def read_words(
-    layout: BeaconLayout,
-    buffers: Float32,
-    check: Callable[[bytes], object] = unprotect_beacon,
-    known: KnownBits | None = None,
-) -> list[bytes | None]:
-    """Decode buffers (n, n_bits) of a layout; None if no sufficiently likely word is found."""
+    code: ldpc.Code, buffers: Float32, check: Callable[[int, bytes], _T | None], known: KnownBits | None = None
+) -> list[_T | None]:
+    """Decode codewords.
+
+    Args:
+        code: the code.
+        buffers: (n, M) log-likelihood ratios of the first bits of the buffers.
+        check: returns the content of information bytes, given their place in the batch, or None if they are wrong.
+        known: what is known of their bits before.
+
+    Returns:
+        Content of each one; None if no sufficiently likely word is found.
+    """
     n_known = np.zeros(len(buffers)) if known is None else known.n_bits
     llr = buffers if known is None else buffers + known.sent
     unsent = None if known is None else ldpc.quantised(known.unsent)
-    found: list[bytes | None] = [None] * len(buffers)
+    found: list[_T | None] = [None] * len(buffers)
 
-    def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        good = np.zeros(places.size, bool)
-        for i, (place, coded) in enumerate(zip(places, np.packbits(bits, axis=1), strict=True)):
-            if check(coded.tobytes()) is not None and is_likely(layout, bits[i], buffers[place], n_known[place]):
-                found[place], good[i] = coded.tobytes(), True
-        return good
+    def accepted(place: int, bits: NDArray[np.uint8]) -> bool:
+        content = check(place, np.packbits(bits).tobytes())
+        if content is not None and is_likely(code, bits, buffers[place], n_known[place]):
+            found[place] = content
+        return found[place] is not None
 
-    ldpc.decode(layout.code, ldpc.quantised(llr), accepted, _ITERATIONS, gives_up=True, unsent_llr=unsent)
+    ldpc.decode(code, ldpc.quantised(llr), accepted, unsent_llr=unsent)
     return found
 
 
-def is_likely(layout: BeaconLayout, information_bits: NDArray[np.uint8], buffer: Float32, n_known: float = 0.0) -> bool:
+def is_likely(code: ldpc.Code, information_bits: NDArray[np.uint8], buffer: Float32, n_known: float = 0.0) -> bool:
     """Whether a decoded word agrees with the soft bits, from which its known bits do not follow."""
-    word = ldpc.encode(layout.code, np.asarray(information_bits, np.uint8)[None])[0, : buffer.size]
-    return bool(log_likelihood(word, buffer) > _MIN_LIKELIHOOD * (layout.code.k - n_known) * LN2)
+    word = ldpc.encode(code, information_bits[None])[0, : buffer.size]
+    return bool(log_likelihood(word, buffer) > _MIN_LIKELIHOOD * (code.k - n_known) * LN2)

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.link.beacons import MIN_REPEATED, gathered, read_words
-from rxcli.link.formats import unprotect_beacon
+from rxcli.link.beacons import MIN_REPEATED, gathered, read_beacons
 from rxcli.link.known_bits import known_bits
 from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
 from rxcli.link.placement import Placement, possible_placements
@@ -100,9 +99,8 @@ def _read(layout: BeaconLayout, sums: list[_Sum]) -> Iterator[tuple[tuple[Messag
         buffers, part = np.stack([b for b, _ in agreeing]), [s for _, s in agreeing]
         known = known_bits(layout, buffers)
         which = np.flatnonzero(known.information(buffers) > TRY_FROM * layout.code.k)
-        words = read_words(layout, buffers[which], known=known.of(which)) if which.size else []
-        for place, word in zip(which.tolist(), words, strict=True):
-            found = None if word is None else unprotect_beacon(word)
+        words = read_beacons(layout, buffers[which], known.of(which)) if which.size else []
+        for place, found in zip(which.tolist(), words, strict=True):
             if found is not None:
                 yield found, part[place]
 

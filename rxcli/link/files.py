@@ -16,14 +16,13 @@ from rxcli.link.formats import (
     Container,
     ContainerError,
     block_prefix,
-    has_crc,
     unpack_container,
+    unprotect,
     unprotect_announcement,
 )
-from rxcli.link.layout import ANNOUNCEMENT_PERIOD, CRC_BYTES, LABEL_BITS, FileLayout, announcement_layout
+from rxcli.link.layout import ANNOUNCEMENT_PERIOD, LABEL_BITS, FileLayout, announcement_layout
 from rxcli.link.placement import Placement, possible_placements
-from rxcli.link.sequences import whiten
-from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, information, log_likelihood, same_bits_llr, surprise
+from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, information, same_bits_llr, surprise
 from rxcli.types import FILE_MEMORY_MB, FrameSoftBits, ObjectProgress
 
 #: Batch size for announcements whose copies do not decide.
@@ -32,13 +31,10 @@ _ANNOUNCEMENTS_AT_ONCE = 32
 _MAX_SHIFTED = 96
 #: Blocks per batch, the share of the remaining blocks that suffices, and frames after which fewer suffice.
 _BLOCKS_AT_ONCE, _SHARE_AT_ONCE, _PATIENT_FRAMES = 32, 0.5, 30
-_ITERATIONS = 25
 #: Increase of information before the next attempt on a block, relative to its bits.
 _RETRY_GAIN = 0.02
 #: Share of decoded blocks in a batch below which the required information is raised.
 _FEW = 0.25
-#: Minimum log-likelihood of a decoded block, relative to the received information.
-_MIN_LIKELIHOOD = 0.5
 #: Bytes of bursts that wait for an announcement.
 _MAX_OPEN = 32 << 20
 #: Largest accepted file, bytes.
@@ -65,7 +61,7 @@ class FileState:
     layout: FileLayout
     #: (B, M) int8 sums of log-likelihood ratios in the decoder's steps.
     total: NDArray[np.int8]
-    #: (B,) bits of information, and the threshold for decoding a block.
+    #: (B,) bits of information, and the threshold for decoding a block; infinite once it is decoded.
     known: NDArray[np.float64]
     threshold: NDArray[np.float64]
     blocks: dict[int, bytes] = field(default_factory=dict)
@@ -119,7 +115,7 @@ class FileState:
         """Add data bursts, numbered from the object's start; `sign` -1 removes them."""
         blocks, labels, passes = (part.ravel() for part in self.layout.labels(bursts))
         ratios = llr.reshape(-1, LABEL_BITS)
-        used = np.flatnonzero(ratios.any(axis=1) & self._open()[blocks])
+        used = np.flatnonzero(ratios.any(axis=1) & np.isfinite(self.threshold)[blocks])
         block = blocks[used]
         place = block[:, None] * self.layout.n_bits + self.layout.bits_of(labels[used], passes[used])
         more = ratios[used].astype(np.int16) * sign
@@ -136,14 +132,9 @@ class FileState:
         )
         self.known += np.bincount(block, gain.reshape(block.size, -1).sum(axis=1), self.layout.n_blocks)
 
-    def _open(self) -> NDArray[np.bool_]:
-        still = np.ones(self.layout.n_blocks, bool)
-        still[list(self.blocks)] = False
-        return still
-
     def ready(self, at_last: bool) -> NDArray[np.int64]:
         """Blocks with enough information to be decoded."""
-        ready = np.flatnonzero((self.known >= self._thresholds(at_last)) & self._open())
+        ready = np.flatnonzero(self.known >= self._thresholds(at_last))
         left = self.layout.n_blocks - len(self.blocks)
         if (
             at_last
@@ -166,26 +157,14 @@ class FileState:
 
     def _read_batch(self, which: NDArray[np.int64]) -> None:
         layout, object_id = self.layout, self.layout.object_id
-        llr = self.total[which]
-
-        masks = [
-            np.frombuffer(whiten(bytes(layout.block_bytes + CRC_BYTES), object_id, int(b)), np.uint8) for b in which
-        ]
-        mask, prefixes = np.stack(masks), [block_prefix(object_id, int(number)) for number in which]
-
-        def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:
-            good = np.zeros(places.size, bool)
-            for i, plain in enumerate(np.packbits(bits, axis=1) ^ mask[places]):
-                coded = plain.tobytes()
-                if has_crc(coded, prefixes[places[i]]) and _is_likely(layout, bits[i], llr[places[i]]):
-                    self.blocks[int(which[places[i]])], good[i] = coded[:-CRC_BYTES], True
-            return good
-
-        read = ldpc.decode(layout.code, llr, accepted, _ITERATIONS)
-        if read.mean() < _FEW:
+        llr = self.total[which] * np.float32(ldpc.LLR_STEP)
+        blocks = [(object_id, block, block_prefix(object_id, block)) for block in which.tolist()]
+        found = read_words(layout.code, llr, lambda place, coded: unprotect(coded, *blocks[place]))
+        self.blocks |= {block: data for (_, block, _), data in zip(blocks, found, strict=True) if data is not None}
+        failed = np.array([data is None for data in found])
+        self.threshold[which] = np.where(failed, self.known[which] + _RETRY_GAIN * layout.code.k, np.inf)
+        if failed.mean() > 1 - _FEW:
             self.min_information = float(self.known[which].mean()) / layout.code.k + _RETRY_GAIN
-        failed = which[~read]
-        self.threshold[failed] = self.known[failed] + _RETRY_GAIN * layout.code.k
 
     def unpacked(self) -> Container | None:
         """The file, if all blocks are decoded and the hash fits; otherwise sets `failure`."""
@@ -244,13 +223,6 @@ class FilesUnderWay:
             return []
         files = "1 incomplete file was" if self._n_dropped == 1 else f"{self._n_dropped} incomplete files were"
         return [f"{files} dropped: together they would take more than {self._max_bytes >> 20} MB (--file-memory)"]
-
-
-def _is_likely(layout: FileLayout, information_bits: NDArray[np.uint8], llr: NDArray[np.int8]) -> bool:
-    """Whether a decoded block agrees with the soft bits of its information part, which every fragment contains."""
-    sent = information_bits[layout.code.first_sent :]
-    received = llr[: sent.size] * ldpc.LLR_STEP
-    return bool(log_likelihood(sent, received) > _MIN_LIKELIHOOD * softbits.LN2 * information(received).sum())
 
 
 @dataclass(slots=True, eq=False)
@@ -352,9 +324,8 @@ class FileSearch:
 
     def _try_candidates(self, candidates: list[_Candidate]) -> None:
         buffers = np.stack([candidate.buffer for candidate in candidates])
-        words = read_words(self._layout, buffers, unprotect_announcement)
-        for candidate, word in zip(candidates, words, strict=True):
-            announcement = None if word is None else unprotect_announcement(word)
+        found = read_words(self._layout.code, buffers, lambda _, word: unprotect_announcement(word))
+        for candidate, announcement in zip(candidates, found, strict=True):
             if announcement is not None:
                 self._announced(announcement, candidate)
 

@@ -30,16 +30,11 @@ def protect(data: bytes, object_id: int, block: int, crc_prefix: bytes = b"") ->
     return whiten(data + crc.to_bytes(CRC_BYTES, "big"), object_id, block)
 
 
-def unprotect(coded: bytes, object_id: int, block: int) -> bytes | None:
+def unprotect(coded: bytes, object_id: int, block: int, crc_prefix: bytes = b"") -> bytes | None:
     """Undo `protect`; None if the CRC does not fit."""
     plain = whiten(coded, object_id, block)
-    return plain[:-CRC_BYTES] if has_crc(plain) else None
-
-
-def has_crc(plain: bytes, crc_prefix: bytes = b"") -> bool:
-    """Whether an unwhitened block ends with its CRC."""
-    crc = zlib.crc32(plain[:-CRC_BYTES], zlib.crc32(crc_prefix))
-    return crc == int.from_bytes(plain[-CRC_BYTES:], "big")
+    data, crc = plain[:-CRC_BYTES], int.from_bytes(plain[-CRC_BYTES:], "big")
+    return data if zlib.crc32(data, zlib.crc32(crc_prefix)) == crc else None
 
 
 def block_prefix(object_id: int, block: int) -> bytes:

@@ -148,8 +148,8 @@ def _solve_core(code: Code, coded: Bits) -> None:
                 solved.add(column)
 
 
-#: Acceptance test of hard decisions: (batch indices (n,), information bits (n, k)) -> (n,) bool.
-Accept = Callable[[NDArray[np.int64], Bits], NDArray[np.bool_]]
+#: Acceptance test of hard decisions: place in the batch, information bits (k,) -> whether they are right.
+Accept = Callable[[int, Bits], bool]
 
 
 def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
@@ -167,8 +167,7 @@ def decode(
     code: Code,
     buffer_llr: NDArray[np.int8],
     accept: Accept,
-    max_iterations: int = 22,
-    gives_up: bool = False,
+    max_iterations: int = 25,
     unsent_llr: NDArray[np.int8] | None = None,
 ) -> NDArray[np.bool_]:
     """Decode a batch of blocks by layered normalised min-sum in 16-bit numbers, until `accept` accepts them.
@@ -178,9 +177,8 @@ def decode(
     Args:
         code: the code.
         buffer_llr: (batch, M) int8: ln p(1)/p(0) in steps of `LLR_STEP` of the first M bits of the buffer, 0 unknown.
-        accept: called after every iteration with batch indices and information bits.
-        max_iterations: maximum number of iterations.
-        gives_up: whether a block that looks like no codeword is given up before all iterations.
+        accept: called after every iteration but the first with the hard decisions of each block.
+        max_iterations: maximum number of iterations; a block that looks like no codeword is given up earlier.
         unsent_llr: (batch, first_sent) likewise of the bits that are never sent, if anything is known of them.
 
     Returns:
@@ -198,15 +196,14 @@ def decode(
     first_share = np.ones(places.size)
     for iteration in range(1, max_iterations + 1):
         layers.update()
-        if iteration == 1 and gives_up:
+        if iteration == 1:
             first_share = layers.unsatisfied()
-        if iteration == 1 and max_iterations > 1:
             continue
         which = np.flatnonzero(still)
-        good = accept(places[which], layers.information(which))
+        good = [accept(*block) for block in zip(places[which].tolist(), layers.information(which), strict=True)]
         accepted[places[which[good]]] = True
         still[which[good]] = False
-        if gives_up and iteration in (_PATIENCE_CERTAIN, _PATIENCE):
+        if iteration in (_PATIENCE_CERTAIN, _PATIENCE):
             max_ratio = np.where(is_certain, _MAX_RATIO_CERTAIN, _MAX_RATIO)
             still &= (layers.unsatisfied() < max_ratio * first_share) | ((iteration < _PATIENCE) & ~is_certain)
         if not still.any():
