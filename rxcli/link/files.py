@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
@@ -15,12 +15,11 @@ from rxcli.link.formats import (
     Announcement,
     Container,
     ContainerError,
-    block_prefix,
     unpack_container,
-    unprotect,
     unprotect_announcement,
+    unprotect_block,
 )
-from rxcli.link.layout import ANNOUNCEMENT_PERIOD, LABEL_BITS, FileLayout, announcement_layout
+from rxcli.link.layout import ANNOUNCEMENT_PERIOD, FileLayout, announcement_layout
 from rxcli.link.placement import Placement, possible_placements
 from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, information, same_bits_llr, surprise
 from rxcli.types import FILE_MEMORY_MB, FrameSoftBits, ObjectProgress
@@ -53,37 +52,37 @@ class _Burst:
     llr: NDArray[np.int8]
 
 
-@dataclass(slots=True, eq=False)
 class FileState:
-    """Reception state of one file."""
+    """Reception state of one file.
 
-    announcement: Announcement
-    layout: FileLayout
-    #: (B, M) int8 sums of log-likelihood ratios in the decoder's steps.
-    total: NDArray[np.int8]
-    #: (B,) bits of information, and the threshold for decoding a block; infinite once it is decoded.
-    known: NDArray[np.float64]
-    threshold: NDArray[np.float64]
-    blocks: dict[int, bytes] = field(default_factory=dict)
-    #: Minimum information for decoding any block, relative to its bits.
-    min_information: float = 0.0
-    done: bool = False
-    #: Reason why the file can never be complete.
-    failure: str | None = None
-    #: Whether the file was dropped to free memory; it restarts with the next announcement.
-    dropped: bool = False
-    frames_waited: int = 0
-    first_time_s: float | None = None
-    last_time_s: float = 0.0
+    Args:
+        announcement: of the file.
+        columns: C.
+        payload_symbols: N.
+    """
 
-    @classmethod
-    def begin(cls, announcement: Announcement, columns: int, payload_symbols: int) -> FileState:
-        """Start an empty file."""
-        layout = FileLayout(announcement.object_id, announcement.length, announcement.mother, columns, payload_symbols)
-        n = layout.n_blocks
-        # The operating system provides memory on first use, so a false length costs nothing.
-        total = np.zeros((n, layout.n_bits), np.int8)
-        return cls(announcement, layout, total, np.zeros(n), np.full(n, layout.ready))
+    def __init__(self, announcement: Announcement, columns: int, payload_symbols: int) -> None:
+        self.announcement = announcement
+        self.layout = FileLayout(
+            announcement.object_id, announcement.length, announcement.mother, columns, payload_symbols
+        )
+        n = self.layout.n_blocks
+        #: (B, M) int8 sums of log-likelihood ratios in the decoder's steps. The operating system provides memory on
+        #: first use, so a false length costs nothing.
+        self.total = np.zeros((n, self.layout.n_bits), np.int8)
+        #: (B,) bits of information, and the threshold for decoding a block; infinite once it is decoded.
+        self.known, self.threshold = np.zeros(n), np.full(n, self.layout.ready)
+        self.blocks: dict[int, bytes] = {}
+        #: Minimum information for decoding any block, bits.
+        self.min_information = 0.0
+        self.done = False
+        #: Reason why the file can never be complete.
+        self.failure: str | None = None
+        #: Whether the file was dropped to free memory; it restarts with the next announcement.
+        self.dropped = False
+        self.frames_waited = 0
+        self.first_time_s: float | None = None
+        self.last_time_s = 0.0
 
     @property
     def under_way(self) -> bool:
@@ -98,8 +97,6 @@ class FileState:
     @property
     def share(self) -> float:
         """Received share of the required information."""
-        if self.done:
-            return 1.0
         part = np.minimum(self.known / self.layout.ready, 0.999)
         part[list(self.blocks)] = 1.0
         return float(part.mean())
@@ -113,58 +110,40 @@ class FileState:
 
     def add(self, bursts: NDArray[np.int64], llr: NDArray[np.int8], sign: int = 1) -> None:
         """Add data bursts, numbered from the object's start; `sign` -1 removes them."""
-        blocks, labels, passes = (part.ravel() for part in self.layout.labels(bursts))
-        ratios = llr.reshape(-1, LABEL_BITS)
-        used = np.flatnonzero(ratios.any(axis=1) & np.isfinite(self.threshold)[blocks])
-        block = blocks[used]
-        place = block[:, None] * self.layout.n_bits + self.layout.bits_of(labels[used], passes[used])
-        more = ratios[used].astype(np.int16) * sign
-        if not self.layout.all_differ(bursts):
-            place, turn = np.unique(place, return_inverse=True)
-            more = np.rint(np.bincount(turn.ravel(), more.ravel(), place.size)).astype(np.int16)
-            block = place // self.layout.n_bits
+        blocks, places = self.layout.places(bursts)
+        used = llr.any(axis=-1) & np.isfinite(self.threshold)[blocks]
+        place, turn = np.unique(blocks[used][:, None] * self.layout.n_bits + places[used], return_inverse=True)
+        more = sign * np.bincount(turn.ravel(), llr[used].ravel(), place.size)
         flat = self.total.reshape(-1)
         before = flat[place]
-        after = np.clip(before + more, -127, 127).astype(np.int8)
-        flat[place] = after
-        gain = (
-            softbits.INFORMATION_OF_STEPS[after.view(np.uint8)] - softbits.INFORMATION_OF_STEPS[before.view(np.uint8)]
-        )
-        self.known += np.bincount(block, gain.reshape(block.size, -1).sum(axis=1), self.layout.n_blocks)
+        flat[place] = after = np.clip(before + more, -127, 127).astype(np.int8)
+        gained, lost = (softbits.INFORMATION_OF_STEPS[steps.view(np.uint8)] for steps in (after, before))
+        self.known += np.bincount(place // self.layout.n_bits, gained - lost, self.layout.n_blocks)
 
-    def ready(self, at_last: bool) -> NDArray[np.int64]:
-        """Blocks with enough information to be decoded."""
-        ready = np.flatnonzero(self.known >= self._thresholds(at_last))
-        left = self.layout.n_blocks - len(self.blocks)
-        if (
-            at_last
-            or self.frames_waited >= _PATIENT_FRAMES
-            or ready.size >= min(_BLOCKS_AT_ONCE, _SHARE_AT_ONCE * left)
-        ):
-            return ready
-        return ready[:0]
+    def read_ready(self, at_last: bool) -> None:
+        """Decode blocks with enough information, several at once unless that takes long."""
+        more = _RETRY_GAIN * self.layout.code.k
+        threshold = self.threshold - 2 * more if at_last else np.maximum(self.threshold, self.min_information)
+        ready = np.flatnonzero(self.known >= threshold)
+        enough = min(_BLOCKS_AT_ONCE, _SHARE_AT_ONCE * (self.layout.n_blocks - len(self.blocks)))
+        if not at_last and self.frames_waited < _PATIENT_FRAMES and ready.size < enough:
+            return
+        for start in range(0, ready.size, _BLOCKS_AT_ONCE):
+            self._read(ready[start : start + _BLOCKS_AT_ONCE], more)
 
-    def _thresholds(self, at_last: bool) -> NDArray[np.float64]:
-        if at_last:
-            return self.threshold - 2 * _RETRY_GAIN * self.layout.code.k
-        return np.maximum(self.threshold, self.min_information * self.layout.code.k)
-
-    def read(self, which: NDArray[np.int64]) -> None:
-        """Decode blocks."""
-        self.frames_waited = 0
-        for start in range(0, which.size, _BLOCKS_AT_ONCE):
-            self._read_batch(which[start : start + _BLOCKS_AT_ONCE])
-
-    def _read_batch(self, which: NDArray[np.int64]) -> None:
-        layout, object_id = self.layout, self.layout.object_id
+    def _read(self, which: NDArray[np.int64], more: float) -> None:
+        """Decode blocks; the next attempt on those that fail takes `more` bits of information."""
+        self.frames_waited, numbers, object_id = 0, which.tolist(), self.layout.object_id
         llr = self.total[which] * np.float32(ldpc.LLR_STEP)
-        blocks = [(object_id, block, block_prefix(object_id, block)) for block in which.tolist()]
-        found = read_words(layout.code, llr, lambda place, coded: unprotect(coded, *blocks[place]))
-        self.blocks |= {block: data for (_, block, _), data in zip(blocks, found, strict=True) if data is not None}
-        failed = np.array([data is None for data in found])
-        self.threshold[which] = np.where(failed, self.known[which] + _RETRY_GAIN * layout.code.k, np.inf)
-        if failed.mean() > 1 - _FEW:
-            self.min_information = float(self.known[which].mean()) / layout.code.k + _RETRY_GAIN
+        found = read_words(
+            self.layout.code, llr, lambda place, coded: unprotect_block(coded, object_id, numbers[place])
+        )
+        read = {number: data for number, data in zip(numbers, found, strict=True) if data is not None}
+        self.blocks |= read
+        self.threshold[which] = self.known[which] + more
+        self.threshold[list(read)] = np.inf
+        if len(read) < _FEW * which.size:
+            self.min_information = float(self.known[which].mean()) + more
 
     def unpacked(self) -> Container | None:
         """The file, if all blocks are decoded and the hash fits; otherwise sets `failure`."""
@@ -357,7 +336,7 @@ class FileSearch:
                 "it was not received"
             )
             return None
-        file = FileState.begin(announcement, self._columns, self._payload_symbols)
+        file = FileState(announcement, self._columns, self._payload_symbols)
         if not self._under_way.admit(file):
             self._add_note(
                 f"a file of {announcement.length} bytes was announced, which takes {file.n_bytes >> 20} MB to receive; "
@@ -378,9 +357,7 @@ class FileSearch:
         for file in self.files.values():
             if not file.under_way:
                 continue
-            which = file.ready(at_last)
-            if which.size:
-                file.read(which)
+            file.read_ready(at_last)
             container = file.unpacked()
             if container is not None:
                 found.append((file, container))

@@ -37,9 +37,18 @@ def unprotect(coded: bytes, object_id: int, block: int, crc_prefix: bytes = b"")
     return data if zlib.crc32(data, zlib.crc32(crc_prefix)) == crc else None
 
 
-def block_prefix(object_id: int, block: int) -> bytes:
-    """Prefix that the CRC of a file's block covers before its data."""
+def _block_prefix(object_id: int, block: int) -> bytes:
     return object_id.to_bytes(2, "big") + block.to_bytes(4, "big")
+
+
+def protect_block(data: bytes, object_id: int, block: int) -> bytes:
+    """Information bits of a file's block, whose CRC covers its object and number, too."""
+    return protect(data, object_id, block, _block_prefix(object_id, block))
+
+
+def unprotect_block(coded: bytes, object_id: int, block: int) -> bytes | None:
+    """Data of a file's block, or None if its CRC does not fit."""
+    return unprotect(coded, object_id, block, _block_prefix(object_id, block))
 
 
 # -- beacons -----------------------------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ first 2 z bits are never sent and filler bits are known zeros; all others, in or
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -30,75 +29,52 @@ Bits = NDArray[np.uint8]
 Edge = tuple[int, int]
 
 
-@dataclass(frozen=True, slots=True)
 class Code:
-    """A code; rows are lists of (block column, shift)."""
+    """A code for `k` information bits.
 
-    graph: int
-    k: int
-    z: int
-    rows: tuple[tuple[Edge, ...], ...]
+    Args:
+        graph: base graph, 1 or 2.
+        k: information bits.
 
-    @property
-    def information_columns(self) -> int:
-        """Block columns of information and filler bits."""
-        return _INFORMATION_COLUMNS[self.graph]
+    Raises:
+        ValueError: `k` is too large for the lifting sizes.
+    """
 
-    @property
-    def filler(self) -> int:
-        """Number of known zeros after the information bits."""
-        return self.information_columns * self.z - self.k
-
-    @property
-    def first_sent(self) -> int:
-        """First information bit that is sent; the buffer begins with it."""
-        return _PUNCTURED * self.z
-
-    @property
-    def n_columns(self) -> int:
-        """Block columns."""
-        return self.information_columns + len(self.rows)
-
-    @property
-    def buffer_bits(self) -> int:
-        """Bits that may be sent."""
-        return (self.n_columns - _PUNCTURED) * self.z - self.filler
+    def __init__(self, graph: int, k: int) -> None:
+        kb = _INFORMATION_COLUMNS[graph]
+        if not 0 < k <= kb * _MAX_LIFTING:
+            raise ValueError(f"k must be in 1..{kb * _MAX_LIFTING} for graph {graph} (got {k})")
+        sizes = (
+            (a << i, number) for number, a in enumerate(_LIFTING_BASES) for i in range(8) if a << i <= _MAX_LIFTING
+        )
+        self.k = k
+        self.z, lifting_set = min((z, number) for z, number in sizes if kb * z >= k)
+        #: Block columns of information and filler bits, and known zeros after the information bits.
+        self.information_columns, self.filler = kb, kb * self.z - k
+        #: First information bit that is sent; the buffer begins with it.
+        self.first_sent = _PUNCTURED * self.z
+        table = _base_graph(graph)
+        #: Each row of checks: block column and shift of its edges.
+        self.rows: list[list[Edge]] = [[] for _ in range(int(table[:, 0].max()) + 1)]
+        for row, column, *shifts in table.tolist():
+            self.rows[row].append((column, shifts[lifting_set] % self.z))
+        self.n_columns = kb + len(self.rows)
+        #: Bits that may be sent.
+        self.buffer_bits = (self.n_columns - _PUNCTURED) * self.z - self.filler
 
     def rows_for(self, buffer_bits: int) -> int:
         """Rows that involve the first `buffer_bits` bits of the buffer."""
-        last = _PUNCTURED * self.z + buffer_bits + self.filler
+        last = self.first_sent + buffer_bits + self.filler
         return min(len(self.rows), max(_CORE_ROWS, -(-last // self.z) - self.information_columns))
+
+
+nr_code = cache(Code)
 
 
 @cache
 def _base_graph(graph: int) -> NDArray[np.int64]:
-    text = Path(__file__).with_name(f"nr_base_graph_{graph}.csv").read_text(encoding="ascii")
-    return np.array([[int(v) for v in line.split(",")] for line in text.split()[1:]], np.int64)
-
-
-def _lifting(k: int, graph: int) -> tuple[int, int]:
-    """The smallest lifting size that holds `k` bits, and its set."""
-    sizes = ((a << i, number) for number, a in enumerate(_LIFTING_BASES) for i in range(8) if a << i <= _MAX_LIFTING)
-    return min((z, number) for z, number in sizes if _INFORMATION_COLUMNS[graph] * z >= k)
-
-
-@cache
-def nr_code(graph: int, k: int) -> Code:
-    """Build the code of base graph 1 or 2 for `k` information bits.
-
-    Raises:
-        ValueError: `k` is too large for the lifting sizes, or smaller than the number of punctured bits.
-    """
-    if not 0 < k <= _INFORMATION_COLUMNS[graph] * _MAX_LIFTING:
-        raise ValueError(f"k must be in 1..{_INFORMATION_COLUMNS[graph] * _MAX_LIFTING} for graph {graph} (got {k})")
-    z, lifting_set = _lifting(k, graph)
-    if k < _PUNCTURED * z:
-        raise ValueError(f"k must be at least {_PUNCTURED * z} (got {k})")
-    table = _base_graph(graph)
-    rows: list[list[Edge]] = [[] for _ in range(int(table[:, 0].max()) + 1)]
-    for row, column, *shifts in table.tolist():
-        rows[row].append((column, shifts[lifting_set] % z))
-    return Code(graph, k, z, tuple(tuple(row) for row in rows))
+    path = Path(__file__).with_name(f"nr_base_graph_{graph}.csv")
+    return np.loadtxt(path, np.int64, delimiter=",", skiprows=1)
 
 
 def encode(code: Code, information: Bits) -> Bits:
@@ -111,41 +87,24 @@ def encode(code: Code, information: Bits) -> Bits:
     Returns:
         (batch, code.buffer_bits) uint8.
     """
-    batch = information.shape[0]
+    batch, kb, core = information.shape[0], code.information_columns, code.rows[:_CORE_ROWS]
     coded = np.zeros((batch, code.n_columns, code.z), np.uint8)
-    kb = code.information_columns
     coded[:, :kb] = np.pad(information, ((0, 0), (0, code.filler))).reshape(batch, kb, code.z)
-    _solve_core(code, coded)
-    for number, row in enumerate(code.rows[_CORE_ROWS:], _CORE_ROWS):
-        coded[:, kb + number] = _sum(coded, [edge for edge in row if edge[0] != kb + number])
+    # The sum of the four core rows contains only one shift of the first parity column and no other parity.
+    shifts = [shift for row in core for column, shift in row if column == kb]
+    (left,) = {shift for shift in shifts if shifts.count(shift) % 2}
+    coded[:, kb] = np.roll(_sum(coded, [edge for row in core for edge in row if edge[0] < kb]), left, axis=1)
+    # Each further row gives the next parity column, without shift.
+    for column, row in enumerate(code.rows[: _CORE_ROWS - 1] + code.rows[_CORE_ROWS:], kb + 1):
+        coded[:, column] = _sum(coded, [edge for edge in row if edge[0] != column])
     flat = coded.reshape(batch, -1)
-    return np.concatenate([flat[:, _PUNCTURED * code.z : code.k], flat[:, kb * code.z :]], axis=1)
+    return np.concatenate([flat[:, code.first_sent : code.k], flat[:, kb * code.z :]], axis=1)
 
 
 def _sum(coded: Bits, edges: list[Edge]) -> Bits:
     """(batch, z) sum over some edges of a row, modulo 2."""
-    total = np.zeros((coded.shape[0], coded.shape[2]), np.uint8)
-    for column, shift in edges:
-        total ^= np.roll(coded[:, column], -shift, axis=1)
-    return total
-
-
-def _solve_core(code: Code, coded: Bits) -> None:
-    """Solve for the four core parity columns: the sum of the four rows contains only a shift of the first column."""
-    kb = code.information_columns
-    core = code.rows[:_CORE_ROWS]
-    shifts = [shift for row in core for column, shift in row if column == kb]
-    (left,) = {shift for shift in shifts if shifts.count(shift) % 2}
-    known = [edge for row in core for edge in row if edge[0] < kb]
-    coded[:, kb] = np.roll(_sum(coded, known), left, axis=1)
-    solved = set(range(kb + 1))
-    while len(solved) < kb + _CORE_ROWS:
-        for row in core:
-            missing = [edge for edge in row if edge[0] not in solved]
-            if len(missing) == 1:
-                (column, shift), *_ = missing
-                coded[:, column] = np.roll(_sum(coded, [e for e in row if e[0] in solved]), shift, axis=1)
-                solved.add(column)
+    rolled = [np.roll(coded[:, column], -shift, axis=1) for column, shift in edges]
+    return np.asarray(np.bitwise_xor.reduce(rolled))
 
 
 #: Acceptance test of hard decisions: place in the batch, information bits (k,) -> whether they are right.
