@@ -117,9 +117,8 @@ def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
 
 
 #: Iterations after which a block is given up as no codeword, and the least ratio of its share of unsatisfied checks to
-#: that after the first iteration at which it is; both again for a block with this share of nearly certain bits.
+#: that after the first iteration at which it is.
 _PATIENCE, _MAX_RATIO = 6, 0.95
-_PATIENCE_CERTAIN, _MAX_RATIO_CERTAIN, _CERTAIN_BITS, _CERTAIN_LLR = 2, 0.4, 0.9, 3.0
 
 
 def decode(
@@ -143,51 +142,30 @@ def decode(
     Returns:
         (batch,) which blocks were accepted.
     """
-    n_rows = code.rows_for(buffer_llr.shape[1])
-    total = _decoder_input(code, buffer_llr, n_rows)
+    batch, n_bits = buffer_llr.shape
+    n_rows, z = code.rows_for(n_bits), code.z
+    # ln p(0)/p(1) by bit and block; filler bits are known to be zero.
+    total = np.zeros(((code.information_columns + n_rows) * z, batch), np.int16)
+    total[np.r_[code.first_sent : code.k, code.information_columns * z : len(total)][:n_bits]] = -buffer_llr.T
+    total[code.k : code.information_columns * z] = _KNOWN
     if unsent_llr is not None:
-        total[: code.first_sent] = -unsent_llr.T.astype(np.int16)
-    layers = _Layers(code, n_rows, total)
-    places = np.arange(buffer_llr.shape[0])
-    accepted = np.zeros(places.size, bool)
-    still = np.ones(places.size, bool)
-    is_certain = (np.abs(buffer_llr) > _CERTAIN_LLR / LLR_STEP).mean(axis=1) > _CERTAIN_BITS
-    first_share = np.ones(places.size)
-    for iteration in range(1, max_iterations + 1):
+        total[: code.first_sent] = -unsent_llr.T
+    layers, places, accepted = _Layers(code, n_rows, total), np.arange(batch), np.zeros(batch, bool)
+    layers.update()
+    first_share = layers.unsatisfied()
+    for iteration in range(2, max_iterations + 1):
         layers.update()
-        if iteration == 1:
-            first_share = layers.unsatisfied()
-            continue
-        which = np.flatnonzero(still)
-        good = [accept(*block) for block in zip(places[which].tolist(), layers.information(which), strict=True)]
-        accepted[places[which[good]]] = True
-        still[which[good]] = False
-        if iteration in (_PATIENCE_CERTAIN, _PATIENCE):
-            max_ratio = np.where(is_certain, _MAX_RATIO_CERTAIN, _MAX_RATIO)
-            still &= (layers.unsatisfied() < max_ratio * first_share) | ((iteration < _PATIENCE) & ~is_certain)
+        good = [accept(*block) for block in zip(places.tolist(), layers.information(), strict=True)]
+        accepted[places[good]] = True
+        still = ~accepted[places]
+        if iteration == _PATIENCE:
+            still &= layers.unsatisfied() < _MAX_RATIO * first_share
         if not still.any():
             break
-        if still.mean() < _CROWDED:
+        if not still.all():
             layers.keep(still)
             places, first_share = places[still], first_share[still]
-            is_certain, still = is_certain[still], still[still]
     return accepted
-
-
-#: Finished blocks are removed when the share of unfinished ones falls below this, since removal costs time.
-_CROWDED = 0.7
-
-
-def _decoder_input(code: Code, buffer_llr: NDArray[np.int8], n_rows: int) -> NDArray[np.int16]:
-    """(block columns * z, batch) int16 ln p(0)/p(1), with filler bits known to be zero."""
-    batch, n_bits = buffer_llr.shape
-    kb, z = code.information_columns, code.z
-    flat = np.zeros(((kb + n_rows) * z, batch), np.int16)
-    systematic = min(n_bits, code.k - _PUNCTURED * z)
-    flat[_PUNCTURED * z : _PUNCTURED * z + systematic] = -buffer_llr[:, :systematic].T.astype(np.int16)
-    flat[code.k : kb * z] = _KNOWN
-    flat[kb * z : kb * z + n_bits - systematic] = -buffer_llr[:, systematic:].T.astype(np.int16)
-    return flat
 
 
 @cache
@@ -222,9 +200,9 @@ class _Layers:
         total = np.ascontiguousarray(self._total[:, blocks])
         self._begin(total, [np.ascontiguousarray(message[:, :, blocks]) for message in self._messages])
 
-    def information(self, blocks: NDArray[np.int64]) -> Bits:
-        """(n, k) hard decisions of some blocks of the batch."""
-        return np.asarray((self._total[: self._code.k] < 0).T[blocks], np.uint8)
+    def information(self) -> Bits:
+        """(batch, k) hard decisions."""
+        return np.asarray((self._total[: self._code.k] < 0).T, np.uint8)
 
     def unsatisfied(self) -> NDArray[np.float64]:
         """(batch,) share of checks that the hard decisions violate."""
