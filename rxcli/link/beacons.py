@@ -221,7 +221,7 @@ def read_beacons(
         min_information: from which one is tried, relative to its bits.
 
     Returns:
-        Largest information of those that were tried, relative to their bits, 0 without any; and place and content of
+        Largest information at an attempt, relative to the bits, 0 without any; and place and content of
         each that is a message.
     """
     buffers = np.stack([gathered(layout, total) for total in totals])
