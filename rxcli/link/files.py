@@ -132,7 +132,7 @@ class FileState:
             self._read(ready[start : start + _BLOCKS_AT_ONCE], more)
 
     def _read(self, which: NDArray[np.int64], more: float) -> None:
-        """Decode blocks; the next attempt on those that fail takes `more` bits of information."""
+        """Decode blocks; where one fails, the next attempt takes `more` bits of information."""
         self.frames_waited, numbers, object_id = 0, which.tolist(), self.layout.object_id
         llr = self.total[which] * np.float32(ldpc.LLR_STEP)
         found = read_words(
