@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError
-from rxcli.ingest.extent import claims_too_much
+from rxcli.ingest.extent import Directories
 from rxcli.ingest.luma import BT601, Luma, Weights, colours_of, luma_of
 from rxcli.ingest.metadata import exif_metadata, jpeg_metadata, tiff_metadata
 from rxcli.ingest.quiet import quiet_libraries
@@ -101,7 +101,7 @@ def _read_tiff(path: Path) -> Frame:
 
     logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)  # what matters comes as an exception
     with path.open("rb") as file:
-        if claims_too_much(file):
+        if Directories(file).claims_too_much:
             raise InputError(f"{path}: the TIFF's directories claim more than the file holds", "copy it again")
         metadata = tiff_metadata(file)
     with damage_explained(f"{path}: the TIFF is damaged or cut", "copy it again"), tifffile.TiffFile(path) as tiff:

@@ -12,7 +12,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rxcli.ingest.extent import claims_too_much, tags_of, values_of
+from rxcli.ingest.extent import Directories
 from rxcli.ingest.jpeg import segments
 from rxcli.ingest.sniff import RAW_SUFFIXES
 from rxcli.types import Metadata
@@ -60,18 +60,18 @@ def exif_metadata(exif: bytes) -> Metadata:
 
 def tiff_metadata(stream: BinaryIO) -> Metadata:
     """Metadata of a TIFF or TIFF-like RAW file; only its directories are read."""
-    return _from_tags(*_load_directories(stream))
+    return _from_tags(*Directories(stream).tags())
 
 
 def is_raw_tiff(path: Path) -> bool:
     """Whether a TIFF file is a camera's RAW in TIFF clothes: a DNG, a mosaic, or a preview with its RAW further on."""
     has_raw_name = path.suffix.lower() in RAW_SUFFIXES
     with path.open("rb") as file:
-        tags, _ = _load_directories(file)
-        if not tags:
-            return has_raw_name
-        file.seek(0)
-        has_raw_samples = not values_of(file, _PHOTOMETRIC).isdisjoint(_RAW_PHOTOMETRICS)
+        directories = Directories(file)
+        tags, _ = directories.tags()
+        has_raw_samples = not directories.values(_PHOTOMETRIC).isdisjoint(_RAW_PHOTOMETRICS)
+    if not tags:
+        return has_raw_name
     return _DNG_VERSION in tags or has_raw_samples or (_MAKE in tags and has_raw_name)
 
 
@@ -129,18 +129,6 @@ def _raw_metadata(file: BinaryIO) -> Metadata:
     if head[:4] in (b"IIRO", b"IIRS", b"IIU\0"):  # TIFF but for the magic number
         return tiff_metadata(io.BytesIO(b"II*\0" + head[4:] + file.read(_HEADER_BYTES - HEAD)))
     return tiff_metadata(file)
-
-
-def _load_directories(stream: BinaryIO) -> tuple[Tags, Tags]:
-    """First and EXIF directory as plain dictionaries, empty where they are broken."""
-    stream.seek(0)
-    if claims_too_much(stream):
-        return {}, {}
-    stream.seek(0)
-    try:
-        return tags_of(stream)
-    except (OSError, OverflowError, ValueError):  # of offsets beyond all files
-        return {}, {}
 
 
 def _from_tags(main: Tags, exif: Tags) -> Metadata:

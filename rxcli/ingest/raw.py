@@ -4,6 +4,7 @@ Frames are views into LibRaw's memory, which lives as long as an array of it doe
 so the decoder is never closed here. Pixels are those of the default crop and are never turned.
 """
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError, reason_of
-from rxcli.ingest.extent import bytes_claimed, claims_too_much, values_of
+from rxcli.ingest.extent import Directories
 from rxcli.ingest.metadata import believed, merge, raw_metadata
 from rxcli.ingest.quiet import quiet_libraries
 from rxcli.ingest.sniff import check_size
@@ -78,10 +79,15 @@ def default_crop(sizes: Any) -> Window:
 
 def _check_whole(path: Path) -> None:
     with path.open("rb") as file:
-        if claims_too_much(file):
+        head, directories = file.read(128), Directories(file)
+        if directories.claims_too_much:
             raise InputError(f"{path}: the RAW file's directories claim more than the file holds", "copy it again")
-        size, claimed = path.stat().st_size, bytes_claimed(file)
-    if size < claimed:
+        claimed = 0
+        if head.startswith(b"FUJIFILMCCD-RAW"):
+            claimed = sum(struct.unpack_from(">II", head.ljust(128, b"\0"), 100))
+        elif head.startswith((b"II*\0", b"MM\0*")):
+            claimed = directories.end
+    if (size := path.stat().st_size) < claimed:
         reason = f"{path}: the RAW file is cut: {size} of at least {claimed} bytes are there"
         raise InputError(reason, "copy it from the camera again")
 
@@ -89,7 +95,7 @@ def _check_whole(path: Path) -> None:
 def _unsupported(path: Path) -> tuple[str, str]:
     """Reason and next step for a file that LibRaw does not know."""
     with path.open("rb") as file:
-        if _JPEG_XL in values_of(file, _COMPRESSION):
+        if _JPEG_XL in Directories(file).values(_COMPRESSION):
             step = "set the camera's RAW files to lossless JPEG, or use the JPEG"
             return f"{path}: the RAW file is compressed as JPEG XL, which LibRaw does not read", step
     return f"{path}: no RAW format that LibRaw knows", "use the JPEG, or convert it to a plain DNG"
