@@ -89,7 +89,7 @@ def clip_metadata(tags: Mapping[str, str]) -> Metadata:
     lower = {name.lower(): value for name, value in tags.items()}
 
     def text(*names: str) -> str | None:
-        return next((found for name in names if (found := _text(lower.get(name)))), None)
+        return next((found for name in names if (found := text_of(lower.get(name)))), None)
 
     return Metadata(
         make=text("make", "com.apple.quicktime.make", "com.android.manufacturer"),
@@ -133,15 +133,15 @@ def _raw_metadata(file: BinaryIO) -> Metadata:
 
 def _from_tags(main: Tags, exif: Tags) -> Metadata:
     def number(*tags: int) -> float | None:
-        values = (_positive(directory.get(tag)) for tag in tags for directory in (exif, main))
+        values = (positive(directory.get(tag)) for tag in tags for directory in (exif, main))
         return next((value for value in values if value is not None), None)
 
     iso = number(_SENSITIVITY)
     return believed(
         Metadata(
-            make=_text(main.get(_MAKE)),
-            model=_text(main.get(_MODEL)),
-            lens=_text(exif.get(_LENS_MODEL)),
+            make=text_of(main.get(_MAKE)),
+            model=text_of(main.get(_MODEL)),
+            lens=text_of(exif.get(_LENS_MODEL)),
             exposure_s=number(_EXPOSURE),
             iso=number(_ISO_SPEED, _RECOMMENDED_INDEX, _SENSITIVITY) if iso == _ISO_OVERFLOW else iso,
             focal_length_mm=number(_FOCAL_LENGTH),
@@ -151,14 +151,16 @@ def _from_tags(main: Tags, exif: Tags) -> Metadata:
     )
 
 
-def _text(value: Any) -> str | None:
+def text_of(value: Any) -> str | None:
+    """What of a name in a file can be printed; None for no name."""
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
     text = value.split("\0")[0].strip() if isinstance(value, str) else ""
     return "".join(c for c in text[:_MAX_CHARACTERS] if c.isprintable()) or None
 
 
-def _positive(value: Any) -> float | None:
+def positive(value: Any) -> float | None:
+    """A number above zero in a file; None for anything else."""
     if isinstance(value, tuple):
         value = value[0] if value else None
     try:
