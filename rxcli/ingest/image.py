@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -26,9 +25,6 @@ from rxcli.ingest.metadata import exif_metadata, jpeg_metadata, tiff_metadata
 from rxcli.ingest.quiet import quiet_libraries
 from rxcli.ingest.sniff import Kind, check_size, damage_explained, read_bytes
 from rxcli.types import Frame, Metadata
-
-#: Pillow's are left out: sizes are checked here, and broken directories do no harm.
-_no_warnings = partial(warnings.catch_warnings, action="ignore")
 
 
 def read_image(path: Path, kind: Kind) -> Frame:
@@ -194,7 +190,7 @@ def _read_with_pillow(data: bytes, path: Path) -> tuple[NDArray[np.uint8], Metad
 
     with (
         damage_explained(f"{path}: the picture is damaged", "copy the file again"),
-        _no_warnings(),
+        warnings.catch_warnings(action="ignore"),  # sizes are checked here, and broken directories do no harm
         Image.open(io.BytesIO(data), formats=("BMP", "WEBP")) as image,
     ):
         check_size(path, *image.size, 18, len(data))  # measured: WebP without loss takes most

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rxcli.errors import InputError, reason_of
 from rxcli.ingest.extent import Directories
-from rxcli.ingest.metadata import believed, merge, raw_metadata
+from rxcli.ingest.metadata import believed, merge, positive, raw_metadata, text_of
 from rxcli.ingest.quiet import quiet_libraries
 from rxcli.ingest.sniff import check_size
 from rxcli.types import Frame, Metadata, Mosaic
@@ -102,9 +102,10 @@ def _unsupported(path: Path) -> tuple[str, str]:
 
 
 def _mosaic(raw: Any, top: int, left: int, path: Path) -> Mosaic:
-    colours = _channel_colours(raw, path)
-    black = _black_per_colour(raw, colours)
-    return Mosaic(_pattern(raw, colours, top, left), _gains(raw), black, _white(raw, max(black)))
+    colours, levels = _channel_colours(raw, path), np.array(raw.black_level_per_channel, np.float64)
+    red, green, blue = (float(levels[colours == colour].mean()) for colour in range(3))
+    white = _white(raw, max(red, green, blue))
+    return Mosaic(_pattern(raw, colours, top, left), _gains(raw), (red, green, blue), white)
 
 
 def _channel_colours(raw: Any, path: Path) -> NDArray[np.uint8]:
@@ -128,12 +129,6 @@ def _pattern(raw: Any, colours: NDArray[np.uint8], top: int, left: int) -> NDArr
     return probe
 
 
-def _black_per_colour(raw: Any, colours: NDArray[np.uint8]) -> tuple[float, float, float]:
-    levels = np.array(raw.black_level_per_channel, np.float64)
-    red, green, blue = (float(levels[colours == colour].mean()) for colour in range(3))
-    return red, green, blue
-
-
 def _gains(raw: Any) -> tuple[float, float, float]:
     """The camera's white balance, else daylight's, else none."""
     for balance in (raw.camera_whitebalance, raw.daylight_whitebalance):
@@ -155,18 +150,17 @@ def _linear_frame(path: Path, pixels: NDArray[np.uint16], raw: Any, metadata: Me
     plane = pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[:, :, 1 if pixels.shape[2] >= 3 else 0])
     plane.flags.writeable = False
     black = float(raw.black_level_per_channel[1 if pixels.ndim == 3 else 0])
-    white = _white(raw, black)
-    return Frame(pixels=plane, source=str(path), metadata=metadata, black=black, white=white, linear=True)
+    return Frame(plane, str(path), metadata=metadata, black=black, white=_white(raw, black), linear=True)
 
 
 def _metadata(path: Path, raw: Any) -> Metadata:
     """Metadata from EXIF, completed by LibRaw."""
     exif, capture = raw_metadata(path), raw.other
     libraw = Metadata(
-        lens=raw.lens.model.strip() or None,
-        exposure_s=capture.shutter_speed if capture.shutter_speed > 0 else None,
-        iso=capture.iso_speed if capture.iso_speed > 0 else None,
-        focal_length_mm=capture.focal_length if capture.focal_length > 0 else None,
+        lens=text_of(raw.lens.model),
+        exposure_s=positive(capture.shutter_speed),
+        iso=positive(capture.iso_speed),
+        focal_length_mm=positive(capture.focal_length),
     )
     orientation = exif.orientation if exif.orientation != 1 else _FLIP_ORIENTATION.get(raw.sizes.flip, 1)
     return replace(merge(exif, believed(libraw)), orientation=orientation)
