@@ -342,6 +342,11 @@ class BurstPosteriors:
         """Posteriors of some columns."""
         return BurstPosteriors(*(getattr(self, f.name)[_columns_of(f.name, columns)] for f in fields(self)))
 
+    def of_burst(self, burst: int) -> BurstPosteriors:
+        """Posteriors of one burst."""
+        values = ((f.name, getattr(self, f.name)) for f in fields(self))
+        return BurstPosteriors(*(value if name in _BY_COLUMN else value[burst, None] for name, value in values))
+
     def with_columns(self, columns: IntArray, some: BurstPosteriors) -> BurstPosteriors:
         """Replace the posteriors of the named columns by `some`."""
 

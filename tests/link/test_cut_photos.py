@@ -16,7 +16,7 @@ from rxcli.link.encoder import message
 from rxcli.link.placement import Placement
 from rxcli.link.receiver import LinkReceiver
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.decode.soft_bits import in_view
+from rxcli.receiver.decode.assemble import in_view
 from rxcli.receiver.decode.steady import is_steady
 from rxcli.receiver.receive import receive_frame
 from rxcli.types import BELIEVABLE, FrameSoftBits

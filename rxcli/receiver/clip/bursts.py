@@ -64,7 +64,7 @@ class Burst:
         """Probability of a column's packet as detected, by the light model alone."""
         return float(np.exp(self.posteriors.log_prob[0, column].sum()))
 
-    def ended(self, view: View) -> confidence.BurstInClip:
+    def ended(self, view: View) -> confidence.BurstInView:
         """What is reported of it; `view` is of the last frame that shows it."""
         assert view.numbers is not None
         features = against = None
@@ -80,7 +80,7 @@ class Burst:
             n_strips = view.acquisition.binned.light.shape[1]
             features = confidence.confidence_features(self.posteriors, margin, undenoised, n_strips, joint)[0]
         index = self.number - int(view.numbers[0])
-        return confidence.BurstInClip(
+        return confidence.BurstInView(
             self.number, index, self.posteriors, self.n_observed, self.frames, features, against
         )
 

@@ -11,7 +11,7 @@ from rxcli.receiver.clip.bursts import Burst
 from rxcli.receiver.clip.timeline import Timeline
 from rxcli.receiver.clip.views import View, Waiting
 from rxcli.receiver.decode import assemble
-from rxcli.receiver.decode.confidence import BurstInClip
+from rxcli.receiver.decode.confidence import BurstInView
 from rxcli.receiver.decode.soft_bits import clip_soft_bits
 from rxcli.types import BELIEVABLE, FrameResult, IntArray, OnTaps
 
@@ -66,7 +66,7 @@ class Reporter:
         return replace(result, columns=columns, status=status, screen_profile=name, soft_bits=soft)
 
 
-def _taps(result: FrameResult, view: View, ended: Sequence[BurstInClip]) -> dict[str, Any]:
+def _taps(result: FrameResult, view: View, ended: Sequence[BurstInView]) -> dict[str, Any]:
     """What is written of a frame: as of a photograph, but strips as tracking samples them, and bursts that end here."""
     found: dict[str, Any] = {"geometry.corners": result.corners, "clock": view.bursts.clock}
     found["geometry.sampled_corners"] = view.context.sampled_corners

@@ -168,7 +168,7 @@ class TrackedScreen:
             positions = known_picture.row_positions(pose.rows, clock)
             fit = known_picture.fit_response(observed.columns, lit, positions, clock.exposure_slots)
             n_slots = int(np.ceil(clock.exposure_slots))
-            expected = known_picture.expected_light(lit, positions, clock.exposure_slots, n_slots, fit.response).light
+            expected = known_picture.expected_light(lit, positions, clock.exposure_slots, n_slots, fit).light
             rows_per_slot, share = clock.rows_per_slot, SETTINGS.frame_share
             if picture.judge(observed.columns, expected, max_misfit, share, rows_per_slot) is None:
                 return None
@@ -392,15 +392,15 @@ def _measured(
     rows, columns, isi_memory = observed.rows, observed.columns, observed.isi_memory
     positions = known_picture.row_positions(rows, clock)
     fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
-    if fit.response.centre < SETTINGS.faded:
-        expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit.response)
+    if fit.centre < SETTINGS.faded:
+        expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit)
         columns = picture.solve_again(observed.light, expected.light, clock.rows_per_slot)
         fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
     if abs(fit.late) > SETTINGS.late_slots:
         clock = replace(clock, row0=clock.row0 - fit.late * clock.rows_per_slot)
         positions = known_picture.row_positions(rows, clock)
         fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
-    expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit.response)
+    expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit)
     judged = picture.judge(columns, expected.light, max_misfit, SETTINGS.frame_share, clock.rows_per_slot)
     if judged is None:
         return None

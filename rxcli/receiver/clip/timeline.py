@@ -128,7 +128,7 @@ class Timeline:
         readout_slots = float(np.ptp(shown)) / view.bursts.clock.rows_per_slot
         return self.time.time_stamp_stretch(readout_slots / self.time.slot_rate_hz)
 
-    def headerless(self, closed: Sequence[confidence.BurstInClip], n_columns: int) -> BoolArray:
+    def headerless(self, closed: Sequence[confidence.BurstInView], n_columns: int) -> BoolArray:
         """Add closed bursts; returns (C,) the columns that have shown no headers."""
         limit = decode_settings.max_llr
         for burst in closed:

@@ -8,7 +8,7 @@ import numpy as np
 
 from rxcli.numerics import TINY
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, bits_per_symbol, indices_to_bits
-from rxcli.receiver.decode.confidence import BurstInClip, Quality, clip_quality, still_quality
+from rxcli.receiver.decode.confidence import BurstInView, quality_of
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import (
     BoolArray,
@@ -71,12 +71,13 @@ def column_results(
         confidence_features: (B, C, 11) of the packets.
         denoised: columns that were corrected by the auto-encoder.
     """
-    quality = still_quality(posteriors, confidence_features)
-    shown = [_Shown(index, index, posteriors, observed) for index, observed in enumerate(n_observed)]
-    bursts = [_burst(frame, burst, quality) for burst in shown]
-    framing = np.ones(len(n_observed)) if frame.framing is None else frame.framing
-    sure = framing[:, None] * quality.confidence >= SETTINGS.min_best_confidence
-    if not any((burst.possible & ~frame.headerless)[sure[index]].any() for index, burst in enumerate(bursts)):
+    bursts = [
+        _burst(frame, BurstInView(None, index, posteriors.of_burst(index), observed, None, features))
+        for index, (observed, features) in enumerate(zip(n_observed, confidence_features, strict=True))
+    ]
+    least = SETTINGS.min_best_confidence * frame.certainty
+    sure = (burst.possible & ~frame.headerless & (burst.confidence >= least) for burst in bursts)
+    if not any(columns.any() for columns in sure):
         # Light without data: an isolated packet is chance.
         bursts = [replace(burst, possible=np.zeros_like(burst.possible)) for burst in bursts]
     columns = _columns(frame, bursts, lambda column: False)
@@ -84,7 +85,7 @@ def column_results(
 
 
 def clip_results(
-    frame: FrameColumns, bursts: Sequence[BurstInClip], goes_on: Callable[[int], bool]
+    frame: FrameColumns, bursts: Sequence[BurstInView], goes_on: Callable[[int], bool]
 ) -> tuple[ColumnResult, ...]:
     """Results of every column in a frame of a clip.
 
@@ -93,26 +94,7 @@ def clip_results(
         bursts: bursts that end in this frame, in time order.
         goes_on: whether the next frame will report a packet of a column.
     """
-    ended = [
-        _burst(frame, _Shown(b.index, 0, b.posteriors, b.n_observed, b.number, b.frames), clip_quality(b))
-        for b in bursts
-    ]
-    return _columns(frame, ended, goes_on)
-
-
-@dataclass(frozen=True, slots=True)
-class _Shown:
-    """What a frame, or a clip up to it, shows of a burst."""
-
-    #: Index in the frame's clock, and in posteriors and quality.
-    index: int
-    place: int
-    posteriors: BurstPosteriors
-    #: (C, packet) how often each slot was observed.
-    n_observed: IntArray
-    #: Number and frames in the clip; None of photographs.
-    number: int | None = None
-    frames: tuple[int, ...] | None = None
+    return _columns(frame, [_burst(frame, burst) for burst in bursts], goes_on)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +102,8 @@ class _Burst:
     """Packets of one burst in all C columns."""
 
     packets: list[PacketResult]
-    #: (C,) weights, and (C, packet) how often each slot was observed.
+    #: (C,) their confidence; weights, and (C, packet) how often each slot was observed.
+    confidence: FloatArray
     w: IntArray
     n_observed: IntArray
     #: (C,) whether a column's packet is in view, repeats its neighbour's, and may be reported.
@@ -129,42 +112,40 @@ class _Burst:
     possible: BoolArray
 
 
-def _burst(frame: FrameColumns, shown: _Shown, quality: Quality) -> _Burst:
+def _burst(frame: FrameColumns, shown: BurstInView) -> _Burst:
     """Packets of a burst."""
-    clock, posteriors, place, n_observed = frame.clock, shown.posteriors, shown.place, shown.n_observed
-    copies = n_observed.sum(axis=1) / clock.packet_slots
-    rows = _header_rows(int((clock.burst == shown.index).argmax()), clock)
-    payloads = _payloads(posteriors.index[place], posteriors.w)
+    clock, posteriors, n_observed, quality = frame.clock, shown.posteriors, shown.n_observed, quality_of(shown)
     # A sum of probabilities may be rounded to more than 1.
     framing = 1.0 if frame.framing is None else min(float(frame.framing[shown.index]), 1.0)
+    confidence = frame.certainty * framing * quality.confidence
     packets = [
         PacketResult(
             first_row=first_row,
             copies=n_copies,
             payload_bits=bits_per_symbol(w) * posteriors.index.shape[2],
             payload=payload,
-            confidence=frame.certainty * framing * confidence,
-            ber_hat=framing * ber_hat + (1 - framing) / 2,
+            confidence=probability,
+            ber_hat=ber_hat,
             burst=shown.number,
             frames=shown.frames,
             confidence_features=tuple(features),
         )
-        for first_row, n_copies, w, payload, confidence, ber_hat, features in zip(
-            rows.tolist(),
-            copies.tolist(),
+        for first_row, n_copies, w, payload, probability, ber_hat, features in zip(
+            _header_rows(int((clock.burst == shown.index).argmax()), clock).tolist(),
+            (n_observed.sum(axis=1) / clock.packet_slots).tolist(),
             posteriors.w.tolist(),
-            payloads,
-            quality.confidence[place].tolist(),
-            quality.ber_hat[place].tolist(),
-            quality.confidence_features[place].tolist(),
+            _payloads(posteriors.index[0], posteriors.w),
+            confidence.tolist(),
+            (framing * quality.ber_hat + (1 - framing) / 2).tolist(),
+            quality.confidence_features.tolist(),
             strict=True,
         )
     ]
     # In a clip, a later frame shows what is missing.
     whole = complete(n_observed, 0 if shown.frames else SETTINGS.max_missing_slots)
-    echo = whole & echoes(posteriors, frame.snr_db)[place]
-    possible = whole & ~echo & (quality.ber_hat[place] <= SETTINGS.max_ber_hat)
-    return _Burst(packets, posteriors.w, n_observed, whole, echo, possible)
+    echo = whole & echoes(posteriors, frame.snr_db)[0]
+    possible = whole & ~echo & (quality.ber_hat <= SETTINGS.max_ber_hat)
+    return _Burst(packets, confidence, posteriors.w, n_observed, whole, echo, possible)
 
 
 def _payloads(index: IntArray, weights: IntArray) -> list[str]:
@@ -295,13 +276,18 @@ def slots_observed(samples: SlotSamples, clock: Clock) -> IntArray:
     return np.stack([by_copy[:, clock.burst == burst].sum(axis=1) for burst in range(int(clock.burst.max()) + 1)])
 
 
-def complete(n_observed: IntArray, max_missing: int = 0) -> BoolArray:
-    """(..., C) whether the payload was observed, from the counts (..., C, packet) of `slots_observed`.
+def in_view(n_observed: IntArray, max_missing: int = 0) -> BoolArray:
+    """(..., C, N) whether symbols of the payload were observed, from the counts (..., C, packet) of `slots_observed`.
 
-    A symbol may miss up to `max_missing` slots: its weight is known, so that mostly one word fits the rest.
+    They may miss up to `max_missing` slots: their weight is known, so that mostly one word fits the rest.
     """
-    missing = (n_observed[..., PREAMBLE_SLOTS:] == 0).reshape(*n_observed.shape[:-1], -1, SLOTS_PER_SYMBOL)
-    return np.asarray((missing.sum(axis=-1) <= max_missing).all(axis=-1))
+    missing = n_observed[..., PREAMBLE_SLOTS:] == 0
+    return np.asarray(missing.reshape(*missing.shape[:-1], -1, SLOTS_PER_SYMBOL).sum(axis=-1) <= max_missing)
+
+
+def complete(n_observed: IntArray, max_missing: int = 0) -> BoolArray:
+    """(..., C) whether the whole payload was observed, see `in_view`."""
+    return np.asarray(in_view(n_observed, max_missing).all(axis=-1))
 
 
 def echoes(posteriors: BurstPosteriors, snr_db: Sequence[float | None]) -> BoolArray:

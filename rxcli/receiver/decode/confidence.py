@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.resources import data_dir
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, IntArray
 
@@ -19,8 +18,6 @@ from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, In
 _MIN_CONTRADICTION = 0.5
 #: Number of the first feature of joint detections, which is 1 for them and 0 for others.
 _FIRST_JOINT = 8
-#: Tolerance when features are compared.
-_FEATURE_TOLERANCE = 1e-4
 #: Upper limit of the negative log probability of a packet, so that its log-odds are finite.
 _MAX_DOUBT = 500.0
 
@@ -59,69 +56,49 @@ def confidence_model() -> ConfidenceModel:
 
 
 @dataclass(frozen=True, slots=True)
-class BurstInClip:
-    """A burst of a clip as reported in the last frame that shows it."""
+class BurstInView:
+    """A burst as reported in the photograph, or in the last frame of a clip, that shows it."""
 
-    #: Number in the clip, and index in the frame's clock.
-    number: int
+    #: Number in the clip, None of photographs; and index in the frame's clock.
+    number: int | None
     index: int
     #: Of this burst alone.
     posteriors: BurstPosteriors
     #: (C, packet) how often each slot was seen, over all frames.
     n_observed: IntArray
-    frames: tuple[int, ...]
-    #: (C, 8) see `confidence_features`; None of tracked frames.
+    #: Of the clip; None of photographs.
+    frames: tuple[int, ...] | None
+    #: (C, 11) see `confidence_features`; None of tracked frames.
     confidence_features: FloatArray | None
     #: (C,) largest log-likelihood of any payload slot against its decision; None where the frames were received like
     #: photographs.
-    against: Float32Array | None
+    against: Float32Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """Confidence of the packets of B bursts and C columns."""
+    """Confidence of the packets of a burst's C columns."""
 
-    #: (B, C) probability that they are error-free, and expected share of wrong bits.
+    #: (C,) probability that they are error-free, and expected share of wrong bits.
     confidence: FloatArray
     ber_hat: FloatArray
-    #: (B, C, 11) see `confidence_features`; (B, C, 3) of tracked bursts, see `clip_features`.
+    #: (C, 11) see `confidence_features`; (C, 3) of tracked bursts, see `clip_features`.
     confidence_features: FloatArray
 
-    def reported(self, min_confidence: float) -> BoolArray:
-        """(B, C) whether a packet is reported."""
-        return np.asarray((self.ber_hat <= SETTINGS.max_ber_hat) & (self.confidence >= min_confidence))
 
+def quality_of(burst: BurstInView) -> Quality:
+    """Confidence of the packets of a burst.
 
-def still_quality(posteriors: BurstPosteriors, confidence_features: FloatArray) -> Quality:
-    """Confidence of the packets of a photograph."""
-    log_odds, share = confidence_log_odds(confidence_features), _share_unsure(posteriors)
-    n_bits = np.maximum((~np.isnan(posteriors.bit_llr)).sum(axis=(-2, -1)), 1)
-    # The likelihoods of a joint detection are too sure of single bits as well.
-    is_joint = confidence_features[..., _FIRST_JOINT] > 0
-    share = np.where(is_joint, np.maximum(share, wrong_share(log_odds, n_bits)), share)
-    return Quality(_probability(log_odds), share, confidence_features)
-
-
-def _share_unsure(posteriors: BurstPosteriors) -> FloatArray:
-    """(B, C) expected share of wrong bits, from the log-likelihood ratios of the bits."""
-    known = ~np.isnan(posteriors.bit_llr)  # symbols of fewer than 7 bits are padded with NaN
-    unsure = 1 / (1 + np.exp(np.abs(posteriors.bit_llr)))
-    return np.asarray(unsure.sum(axis=(-2, -1), where=known) / known.sum(axis=(-2, -1)))
-
-
-def clip_quality(burst: BurstInClip) -> Quality:
-    """Confidence of the packets of a burst of a clip.
-
-    Errors of the known picture and of compression are correlated over slots and copies, so the likelihoods are too
-    sure. Slots that contradict the decided codeword reveal it.
+    Errors of a known picture and of compression are correlated over slots and copies, so the likelihoods of bits are
+    too sure in clips; those of a joint detection are, too.
     """
-    if burst.confidence_features is not None:
-        return still_quality(burst.posteriors, burst.confidence_features[None])
-    features = clip_features(burst)[None]
-    log_odds = clip_log_odds(burst)
-    n_bits = np.maximum((~np.isnan(burst.posteriors.bit_llr)).sum(axis=(-2, -1)), 1)
-    ber_hat = np.maximum(_share_unsure(burst.posteriors), wrong_share(log_odds, n_bits))
-    return Quality(_probability(log_odds), ber_hat, features)
+    log_odds, bit_llr, features = log_odds_of(burst), burst.posteriors.bit_llr[0], burst.confidence_features
+    known = ~np.isnan(bit_llr)  # symbols of fewer than 7 bits are padded with NaN
+    n_bits = np.maximum(known.sum(axis=(-2, -1)), 1)
+    share = (1 / (1 + np.exp(np.abs(bit_llr)))).sum(axis=(-2, -1), where=known) / n_bits
+    is_too_sure = True if features is None else features[..., _FIRST_JOINT] > 0
+    ber_hat = np.where(is_too_sure, np.maximum(share, wrong_share(log_odds, n_bits)), share)
+    return Quality(_probability(log_odds), ber_hat, clip_features(burst) if features is None else features)
 
 
 def wrong_share(log_odds: FloatArray, n_bits: IntArray) -> FloatArray:
@@ -131,17 +108,18 @@ def wrong_share(log_odds: FloatArray, n_bits: IntArray) -> FloatArray:
     return np.asarray(np.minimum(wrong_bits_at_even_odds * np.exp(-model.exponent * log_odds), 0.5))
 
 
-def clip_log_odds(burst: BurstInClip) -> FloatArray:
-    """(1, C) calibrated log-odds of the packets of a burst of a clip being error-free."""
+def log_odds_of(burst: BurstInView) -> FloatArray:
+    """(C,) calibrated log-odds of the packets of a burst being error-free."""
     if burst.confidence_features is not None:
-        return confidence_log_odds(burst.confidence_features[None])
-    return np.asarray(clip_features(burst)[None] @ np.array(confidence_model().clips.weights))
+        return confidence_log_odds(burst.confidence_features)
+    return np.asarray(clip_features(burst) @ np.array(confidence_model().clips.weights))
 
 
-def clip_features(burst: BurstInClip) -> FloatArray:
+def clip_features(burst: BurstInView) -> FloatArray:
     """(C, 3) features of the confidence of a tracked burst's packets, in the order of the weights.
 
-    The posterior is limited: beyond the limit errors are not due to noise.
+    The posterior is limited: beyond the limit errors are not due to noise. Slots that contradict the decided codeword
+    reveal such.
     """
     assert burst.against is not None
     log_odds = np.minimum(_log_odds(burst.posteriors.log_prob.sum(axis=2))[0], confidence_model().clips.max_log_odds)
@@ -205,7 +183,7 @@ def confidence_log_odds(confidence_features: FloatArray) -> FloatArray:
     log_odds = np.asarray(confidence_features @ np.array(model.weights))
     posterior, average = confidence_features[..., 1], confidence_features[..., 4]
     # Columns that were detected jointly have no average, and are never plain.
-    plain = (average > np.log(model.max_average) - _FEATURE_TOLERANCE) & (posterior < model.max_log_odds)
+    plain = np.isclose(average, np.log(model.max_average)) & (posterior < model.max_log_odds)
     # The limit applies only to packets that are more likely right than wrong.
     return np.asarray(np.where(plain, np.minimum(log_odds, np.maximum(posterior, 0.0)), log_odds))
 

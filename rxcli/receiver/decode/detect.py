@@ -7,6 +7,7 @@ Trans. Inf. Theory 20(2), 1974). Header and dimming symbol are known once the we
 are fixed, and the sum over all paths is the evidence for `w`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from math import comb
@@ -26,12 +27,12 @@ from rxcli.protocol import (
 )
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.receiver.light import slot_llr
-from rxcli.types import BurstPosteriors, Float32Array, FloatArray
+from rxcli.types import BurstPosteriors, Float32Array, FloatArray, IntArray
 
 #: Lower limit of likelihoods of states and slots relative to the likeliest one, so that their logarithm exists.
 _MIN_LIKELIHOOD = 1e-60
-#: Slots between rescalings of likelihoods.
-_SCALED_AFTER = 4
+#: Most bits of a symbol.
+MAX_BITS = max(map(bits_per_symbol, WEIGHTS))
 
 
 def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> BurstPosteriors:
@@ -43,32 +44,52 @@ def detect(metrics: FloatArray, candidates: NDArray[np.bool_] | None = None) -> 
             slots are not used; the last `isi_memory` are the first slots of the header that follows.
         candidates: (C, 9) weights to consider, all by default.
     """
-    n_bursts, n_columns, length, _ = metrics.shape
     if candidates is None:
-        candidates = np.ones((n_columns, len(WEIGHTS)), bool)
-    length -= _isi_memory_of(metrics)
-    n_symbols = (length - PREAMBLE_SLOTS) // SLOTS_PER_SYMBOL
-    w_log_evidence = np.full((n_columns, len(WEIGHTS)), -np.inf)
-    lit = np.empty((n_bursts, n_columns, length), np.float32)
-    index = np.empty((n_bursts, n_columns, n_symbols), np.int64)
-    log_prob = np.empty(index.shape)
-    bit_llr = np.full((*index.shape, 7), np.nan)
+        candidates = np.ones((metrics.shape[1], len(WEIGHTS)), bool)
     trellises = _trellises(metrics, candidates)
-    for trellis in trellises:
-        w_log_evidence[trellis.columns, trellis.w - 1] = trellis.log_evidence
-    for trellis in trellises:
-        likeliest = w_log_evidence[trellis.columns].argmax(axis=1) == trellis.w - 1
-        if not likeliest.any():
-            continue
-        columns, w, posterior = trellis.columns[likeliest], trellis.w, trellis.word_posteriors(likeliest)
+    w_log_evidence = np.full(candidates.shape, -np.inf)
+    for w, trellis in trellises.items():
+        w_log_evidence[trellis.columns, w - 1] = trellis.log_evidence
+    log_evidence = np.logaddexp.reduce(w_log_evidence, axis=1)
+    return posteriors_of(
+        w_log_evidence.argmax(axis=1) + 1,
+        w_log_evidence - log_evidence[:, None],
+        log_evidence,
+        header_llr(metrics),
+        (metrics.shape[2] - PREAMBLE_SLOTS) // SLOTS_PER_SYMBOL,
+        lambda w, columns: trellises[w].word_posteriors(np.isin(trellises[w].columns, columns)),
+    )
+
+
+def posteriors_of(
+    weights: IntArray,
+    w_log_prob: FloatArray,
+    log_evidence: FloatArray,
+    header_llr: FloatArray,
+    n_symbols: int,
+    of_words: Callable[[int, IntArray], FloatArray],
+) -> BurstPosteriors:
+    """Posteriors of slots, symbols and bits from those of words.
+
+    Args:
+        weights: (C,) of the columns.
+        w_log_prob, log_evidence, header_llr: see `BurstPosteriors`.
+        n_symbols: of the payload, N.
+        of_words: the (B, columns, N, words) probabilities of the words of a weight in some columns.
+    """
+    shape = (*header_llr.shape, n_symbols)
+    lit = np.empty((*header_llr.shape, PREAMBLE_SLOTS + n_symbols * SLOTS_PER_SYMBOL), np.float32)
+    index, log_prob = np.empty(shape, np.int64), np.empty(shape)
+    bit_llr = np.full((*shape, MAX_BITS), np.nan)
+    for w in np.unique(weights).tolist():
+        columns = np.flatnonzero(weights == w)
+        posterior, n_bits = of_words(w, columns), bits_per_symbol(w)
         lit[:, columns, :PREAMBLE_SLOTS] = preamble_slots(w)
-        lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(w)).reshape(n_bursts, columns.size, -1)
+        lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(w)).reshape(len(lit), columns.size, -1)
         index[:, columns] = best = posterior.argmax(axis=-1)
         log_prob[:, columns] = log_of_best(posterior, best)
-        bit_llr[:, columns, :, : bits_per_symbol(w)] = llr_of_bits(posterior, bits_per_symbol(w))
-    log_evidence = np.logaddexp.reduce(w_log_evidence, axis=1)
-    weights, w_log_prob = w_log_evidence.argmax(axis=1) + 1, w_log_evidence - log_evidence[:, None]
-    return BurstPosteriors(weights, w_log_prob, log_evidence, lit, index, log_prob, bit_llr, header_llr(metrics))
+        bit_llr[:, columns, :, :n_bits] = llr_of_bits(posterior, n_bits)
+    return BurstPosteriors(weights, w_log_prob, log_evidence, lit, index, log_prob, bit_llr, header_llr)
 
 
 def _isi_memory_of(metrics: FloatArray) -> int:
@@ -201,7 +222,7 @@ class _Trellis:
         return np.moveaxis(np.divide(joint, total, out=uniform, where=total > 0), 0, 2)
 
 
-def _trellises(metrics: FloatArray, candidates: NDArray[np.bool_]) -> list[_Trellis]:
+def _trellises(metrics: FloatArray, candidates: NDArray[np.bool_]) -> dict[int, _Trellis]:
     """Trellis of the columns of each candidate weight, from metrics (B, C, packet + memory, patterns)."""
     isi_memory = _isi_memory_of(metrics)
     payload = metrics[:, :, PREAMBLE_SLOTS : metrics.shape[2] - isi_memory]
@@ -213,11 +234,11 @@ def _trellises(metrics: FloatArray, candidates: NDArray[np.bool_]) -> list[_Trel
     boundary, top = _over_likeliest(boundary)
     words = slots[..., isi_memory:, :].reshape(*slots.shape[:-2], -1)
     log_scale = top.sum(axis=(0, 1, -1))
-    return [
-        _trellis(w, chosen, metrics[:, chosen], words[:, :, chosen], boundary[:, :, chosen], log_scale[chosen])
+    return {
+        w: _trellis(w, chosen, metrics[:, chosen], words[:, :, chosen], boundary[:, :, chosen], log_scale[chosen])
         for w in WEIGHTS
         if (chosen := np.flatnonzero(candidates[:, w - 1])).size
-    ]
+    }
 
 
 def _trellis(
@@ -295,16 +316,12 @@ def free_log_evidence(metrics: FloatArray, share: FloatArray) -> FloatArray:
     # A pattern is the state (the slots before) and the slot itself; the next state drops the oldest slot.
     by_slot, tops = _over_likeliest(metrics.swapaxes(0, 1) + np.tile(log_prior, n_patterns // 2))
     steps = np.maximum(by_slot, _MIN_LIKELIHOOD).reshape(-1, n_columns, 2, n_patterns // 4, 2)
-    log_evidence = tops[..., 0].sum(axis=0)
-    state = np.full((n_columns, n_patterns // 2), 2 / n_patterns)
-    for number, step in enumerate(steps, 1):
+    state, totals = np.full((n_columns, n_patterns // 2), 2 / n_patterns), np.empty_like(tops)
+    for step, total in zip(steps, totals, strict=True):
         pattern = state.reshape(n_columns, 2, -1, 1) * step
         state = (pattern[:, 0] + pattern[:, 1]).reshape(n_columns, -1)
-        if number % _SCALED_AFTER == 0:
-            top = state.max(axis=1, keepdims=True)
-            log_evidence += np.log(top[:, 0])
-            state /= top
-    return np.asarray(log_evidence + np.log(state.sum(axis=1)))
+        state /= state.sum(axis=1, keepdims=True, out=total)
+    return np.asarray((tops + np.log(totals))[..., 0].sum(axis=0))
 
 
 def slot_margin(metrics: FloatArray, decided: NDArray[np.bool_]) -> Float32Array:
@@ -368,9 +385,9 @@ def weight_shares(w_log_prob: FloatArray) -> FloatArray:
     """
     own = SETTINGS.weight_temper * w_log_prob
     shares = np.full(len(WEIGHTS), 1 / len(WEIGHTS))
-    for _ in range(SETTINGS.weight_rounds):
+    for _ in own:  # Many rounds, which converge; a column more, of any weight, is assumed beside those in view.
         posterior = own + np.log(shares)
         posterior = np.exp(posterior - np.logaddexp.reduce(posterior, axis=1, keepdims=True))
-        shares = posterior.sum(axis=0) + SETTINGS.other_weights
+        shares = posterior.sum(axis=0) + 1 / len(WEIGHTS)
         shares /= shares.sum()
     return shares

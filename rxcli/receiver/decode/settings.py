@@ -14,11 +14,8 @@ class DecodeSettings(msgspec.Struct, frozen=True):
     min_best_confidence: float = 0.1
     #: Minimum probability of a weight at which its soft bits are used.
     min_weight_probability: float = 0.99
-    #: Weights that columns have in common: weight of evidence, because errors of samples are correlated; number of
-    #: columns of each weight that are assumed beside those in view; and rounds of estimating the shares.
+    #: Weight of the evidence for weights that columns have in common, because errors of samples are correlated.
     weight_temper: float = 0.08
-    other_weights: float = 0.1
-    weight_rounds: int = 20
     #: A column below this signal-to-noise ratio, dB, is too dark to try.
     dark_snr_db: float = 0.0
     #: Minimum log-likelihood ratio of a column's headers, all bursts together, against arbitrary slots.
@@ -50,21 +47,16 @@ class DecodeSettings(msgspec.Struct, frozen=True):
 class SurvivorSettings(msgspec.Struct, frozen=True):
     """Joint detection of slots and picture."""
 
-    #: Most paths that are kept, and log-likelihood below the best path at which one is dropped.
+    #: Most paths that are kept.
     max_paths: int = 24
-    max_lag: float = 18.0
     #: Effective number of independent samples per slot and strip.
     information: float = 0.5
     #: Change of the picture per slot, its deviation at the start, both relative; degrees of freedom of its errors.
     drift_per_slot: float = 0.06
     first_deviation: float = 0.3
     degrees: float = 1.5
-    #: Limits: increase of the picture's variance at an outlier, its variance relative to the picture, and in units of
-    #: the local light; the picture in units of the local light.
-    max_jump: float = 1e4
+    #: Limits: variance of the picture relative to its square; the picture against the local light, more or less.
     max_variance: float = 4.0
-    min_variance: float = 1e-8
-    min_picture: float = 1e-3
     max_picture: float = 1e3
 
 

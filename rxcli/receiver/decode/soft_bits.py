@@ -6,17 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
-from rxcli.receiver.decode.assemble import echoes
-from rxcli.receiver.decode.confidence import BurstInClip, clip_log_odds, confidence_log_odds, wrong_share
+from rxcli.receiver.decode.assemble import echoes, in_view
+from rxcli.receiver.decode.confidence import BurstInView, confidence_log_odds, log_odds_of, wrong_share
 from rxcli.receiver.decode.settings import SETTINGS
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, FrameSoftBits, IntArray
-
-
-def in_view(n_observed: IntArray, max_missing: int = 0) -> BoolArray:
-    """(..., N) whether at most some slots of a payload symbol were not observed, from counts (..., packet)."""
-    missing = n_observed[..., PREAMBLE_SLOTS:] == 0
-    return np.asarray(missing.reshape(*missing.shape[:-1], -1, SLOTS_PER_SYMBOL).sum(axis=-1) <= max_missing)
 
 
 def assume_unobserved_certain(posteriors: BurstPosteriors, n_observed: IntArray) -> BurstPosteriors:
@@ -79,14 +72,14 @@ def still_soft_bits(
     return FrameSoftBits(np.arange(len(n_observed)), llr)
 
 
-def clip_soft_bits(bursts: Sequence[BurstInClip], snr_db: Sequence[float | None], epoch: int) -> FrameSoftBits | None:
+def clip_soft_bits(bursts: Sequence[BurstInView], snr_db: Sequence[float | None], epoch: int) -> FrameSoftBits | None:
     """The soft bits of the bursts that end in a frame of a clip, or None."""
     if not bursts:
         return None
     parts = []
     for burst in bursts:
         n_observed = burst.n_observed[None]
-        log_odds = clip_log_odds(replace(burst, posteriors=assume_unobserved_certain(burst.posteriors, n_observed)))
+        log_odds = log_odds_of(replace(burst, posteriors=assume_unobserved_certain(burst.posteriors, n_observed)))[None]
         limits = llr_limits(burst.posteriors, n_observed, log_odds)
         parts.append(limit_llr(burst.posteriors, limits, echoes(burst.posteriors, snr_db)))
     return FrameSoftBits(np.array([burst.number for burst in bursts], np.int64), np.concatenate(parts), epoch)

@@ -16,7 +16,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rxcli.numerics import TINY
 from rxcli.protocol import (
@@ -24,16 +23,17 @@ from rxcli.protocol import (
     PREAMBLE_SLOTS,
     SLOTS_PER_SYMBOL,
     WEIGHTS,
-    bits_per_symbol,
     codebook,
     dimming_symbol,
     slot_patterns,
 )
-from rxcli.receiver.decode.detect import llr_of_bits, log_of_best, preamble_slots, weight_shares
+from rxcli.receiver.decode.detect import posteriors_of, weight_shares
 from rxcli.receiver.decode.settings import SURVIVORS, SurvivorSettings
 from rxcli.receiver.light import exposed_from
 from rxcli.types import BoolArray, BurstPosteriors, BurstSamples, Float32Array, FloatArray, IntArray
 
+#: Likelihood of a path against the best one's below which it is dropped: that of rounding in single precision.
+_NEGLIGIBLE = float(np.finfo(np.float32).eps)
 #: Log probability of what cannot be.
 _NEVER = -1e9
 #: Number of bits of a path's slots of a path as a number; the bits of a word.
@@ -87,33 +87,27 @@ def detect(
 
     With `has_common_weights` the weights of all columns are the prior of each.
     """
-    n_bursts, n_columns, n_slots = samples.n_bursts, samples.n_columns, samples.light.shape[0]
-    paths, steps, ends = _forward(samples, settings, is_free=False)
+    n_bursts, n_columns = samples.n_bursts, samples.n_columns
+    paths, steps, ends, is_followed = _forward(samples, settings, is_free=False)
     words = _backward(steps, ends, np.zeros_like(paths.log_likelihood))
+    posterior, of_paths, _ = words[0]
+    by_weight = np.stack([(posterior * (of_paths == w)).sum(axis=1) for w in WEIGHTS], axis=1)
+    by_burst = np.log(np.maximum(by_weight, TINY)).reshape(n_bursts, n_columns, -1)
     # One weight for all bursts of a column; without the symbol that shows it, its paths may have been dropped.
-    shown, by_burst = shows_weight(samples)[..., None], _weight_log_prob(*words[0]).reshape(n_bursts, n_columns, -1)
+    shown = shows_weight(samples)[..., None]
     w_log_prob = (by_burst * (shown | ~shown.any(axis=0))).sum(axis=0)
     w_log_prob = w_log_prob - np.logaddexp.reduce(w_log_prob, axis=1, keepdims=True)
     common = np.log(weight_shares(w_log_prob)) if has_common_weights else 0.0
-    w = (w_log_prob + common).argmax(axis=1) + 1
-    shape = (n_bursts, n_columns, n_slots // SLOTS_PER_SYMBOL - PREAMBLE_SLOTS // SLOTS_PER_SYMBOL)
-    lit = np.empty((n_bursts, n_columns, n_slots), np.float32)
-    index, log_prob = np.zeros(shape, np.int64), np.zeros(shape)
-    bit_llr = np.full((*shape, 7), np.nan)
-    is_word = _counting(samples)[1][PREAMBLE_SLOTS // SLOTS_PER_SYMBOL :, :, 0].T.reshape(shape)
-    for weight in np.unique(w).tolist():
-        columns = np.flatnonzero(w == weight)
-        posterior = _word_posteriors(words, weight, shape)[:, columns]
-        posterior[~is_word[:, columns]] = 1 / posterior.shape[-1]
-        lit[:, columns, :PREAMBLE_SLOTS] = preamble_slots(weight)
-        lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(weight)).reshape(n_bursts, columns.size, -1)
-        index[:, columns] = best = posterior.argmax(axis=-1)
-        log_prob[:, columns] = log_of_best(posterior, best)
-        n_bits = bits_per_symbol(weight)
-        bit_llr[:, columns, :, :n_bits] = llr_of_bits(posterior, n_bits)
+    is_word = is_followed[-len(words) :, :, 0].T
+
+    def of_words(w: int, columns: IntArray) -> FloatArray:
+        posterior = _word_posteriors(words, w)
+        posterior[~is_word] = 1 / posterior.shape[-1]
+        return posterior.reshape(n_bursts, n_columns, *posterior.shape[1:])[:, columns]
+
+    weights = (w_log_prob + common).argmax(axis=1) + 1
     evidence = _log_evidence(paths, samples, settings).reshape(n_bursts, n_columns).sum(axis=0)
-    header_llr = np.zeros((n_bursts, n_columns))
-    return BurstPosteriors(w, w_log_prob, evidence, lit, index, log_prob, bit_llr, header_llr)
+    return posteriors_of(weights, w_log_prob, evidence, np.zeros((n_bursts, n_columns)), len(words), of_words)
 
 
 def shows_weight(samples: BurstSamples) -> BoolArray:
@@ -126,7 +120,7 @@ def shows_weight(samples: BurstSamples) -> BoolArray:
 
 def lane_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> FloatArray:
     """(lanes,) log evidence of packets in each burst and column; see `BurstPosteriors.log_evidence`."""
-    paths, _, _ = _forward(samples, settings, is_free=False)
+    paths, *_ = _forward(samples, settings, is_free=False)
     return _log_evidence(paths, samples, settings)
 
 
@@ -146,14 +140,14 @@ def side_by_side(parts: Sequence[BurstSamples]) -> BurstSamples:
 
 def free_log_evidence(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> FloatArray:
     """(C,) log evidence of arbitrary slots, all bursts together; see `BurstPosteriors.log_evidence`."""
-    paths, _, _ = _forward(samples, settings, is_free=True)
+    paths, *_ = _forward(samples, settings, is_free=True)
     log_evidence = _log_evidence(paths, samples, settings)
     return np.asarray(log_evidence.reshape(samples.n_bursts, samples.n_columns).sum(axis=0))
 
 
 def detect_free(samples: BurstSamples, settings: SurvivorSettings = SURVIVORS) -> tuple[Float32Array, FloatArray]:
     """(lanes, slots) probability that arbitrary slots are lit, one half before the payload; (lanes,) log evidence."""
-    paths, steps, ends = _forward(samples, settings, is_free=True)
+    paths, steps, ends, _ = _forward(samples, settings, is_free=True)
     lit = np.full((len(paths.w), samples.light.shape[0]), 0.5, np.float32)
     words = _backward(steps, ends, np.zeros_like(paths.log_likelihood))
     for (n, _), (posterior, _, word) in zip(ends, words, strict=True):
@@ -169,8 +163,12 @@ def _log_evidence(paths: _Paths, samples: BurstSamples, settings: SurvivorSettin
 
 def _forward(
     samples: BurstSamples, settings: SurvivorSettings, *, is_free: bool
-) -> tuple[_Paths, list[_Step], list[tuple[int, _Paths]]]:
-    """Extend the paths slot by slot; returns the last paths, the steps and the paths at the end of every symbol."""
+) -> tuple[_Paths, list[_Step], list[tuple[int, _Paths]], BoolArray]:
+    """Extend the paths slot by slot.
+
+    Returns:
+        The last paths, the steps, the paths at the end of every symbol, and what symbols are words, see `_counting`.
+    """
     n_slots = samples.light.shape[0]
     taps = exposed_from(samples.exposure_slots, samples.light.shape[1])
     reach = taps.shape[1] - 1
@@ -186,7 +184,7 @@ def _forward(
         books = 0 * paths.w + book if book is not None else np.where(is_followed[symbol], paths.w, _ARBITRARY)
         origin, branches, gain = _branches(paths, books, place)
         if is_dimming and place == SLOTS_PER_SYMBOL - 1 and not is_free:
-            branches.w = _n_lit()[branches.slots & _WORD]
+            branches.w = np.bitwise_count(branches.slots & _WORD).astype(np.int64)
             if samples.w_log_prior is not None:
                 gain = gain + np.take_along_axis(
                     samples.w_log_prior, np.clip(branches.w, WEIGHTS[0], WEIGHTS[-1]) - 1, 1
@@ -207,7 +205,7 @@ def _forward(
         paths = remaining
         if PREAMBLE_SLOTS <= n < n_slots and place == SLOTS_PER_SYMBOL - 1:
             ends.append((n, paths))
-    return paths, steps, ends
+    return paths, steps, ends, is_followed
 
 
 def _counting(samples: BurstSamples) -> tuple[IntArray, BoolArray]:
@@ -303,7 +301,6 @@ def _update(
         squared += nu
         squared /= nu + 1
         np.maximum(squared, 1, out=squared)
-        np.minimum(squared, settings.max_jump, out=squared)
         squared *= variance
         variance = np.minimum(squared, largest, out=squared)
         power *= variance
@@ -314,12 +311,12 @@ def _update(
             gain *= valid
         error *= gain
         error += picture
-        np.maximum(error, settings.min_picture, out=error)
+        np.maximum(error, 1 / settings.max_picture, out=error)
         picture = np.minimum(error, settings.max_picture, out=error)
         gain *= light
         np.subtract(1, gain, out=gain)
         gain *= variance
-        variance = np.maximum(gain, np.float32(settings.min_variance), out=gain)
+        variance = np.maximum(gain, 0, out=gain)
     branches.picture, branches.variance = picture, variance
     return np.asarray(total / (2 * q), np.float64)
 
@@ -341,7 +338,7 @@ def _merged(branches: _Paths, n_recent: IntArray | None, settings: SurvivorSetti
     if n_recent is not None:
         best, group, n_groups = _groups(branches, n_recent)
         share = np.bincount(group.ravel(), share.ravel(), lanes * n_groups).reshape(lanes, n_groups)
-    n_chosen = min(settings.max_paths, int((share > np.exp(-settings.max_lag)).sum(axis=1).max()), n_groups)
+    n_chosen = min(settings.max_paths, int((share > _NEGLIGIBLE).sum(axis=1).max()), n_groups)
     chosen: IntArray = np.arange(n_groups) + 0 * lane
     if n_chosen < n_groups:
         chosen = np.argpartition(-share, n_chosen - 1, axis=1)[:, :n_chosen]
@@ -399,17 +396,11 @@ def _backward(steps: list[_Step], ends: list[tuple[int, _Paths]], after: FloatAr
     return out[::-1]
 
 
-def _weight_log_prob(posterior: FloatArray, w: IntArray, _: IntArray) -> FloatArray:
-    """(lanes, 9) log probability of each weight."""
-    by_weight = np.stack([(posterior * (w == weight)).sum(axis=1) for weight in WEIGHTS], axis=1)
-    return np.asarray(np.log(np.maximum(by_weight, TINY)))
-
-
-def _word_posteriors(words: _Words, weight: int, shape: tuple[int, int, int]) -> FloatArray:
-    """(B, C, N, words) posterior of the words of a weight, uniform where no path of that weight is left."""
+def _word_posteriors(words: _Words, weight: int) -> FloatArray:
+    """(lanes, N, words) posterior of the words of a weight, uniform where no path of that weight is left."""
     place_of = np.full(_WORD + 1, -1)
     place_of[codebook(weight) @ (1 << np.arange(SLOTS_PER_SYMBOL - 1, -1, -1))] = np.arange(len(codebook(weight)))
-    out = np.empty((shape[0] * shape[1], shape[2], len(codebook(weight))))
+    out = np.empty((len(words[0][0]), len(words), len(codebook(weight))))
     lane = np.arange(len(out))[:, None]
     for number, (posterior, w, word) in enumerate(words):
         # A little for every word, since paths that were dropped are not impossible.
@@ -417,13 +408,7 @@ def _word_posteriors(words: _Words, weight: int, shape: tuple[int, int, int]) ->
         place = place_of[word]
         np.add.at(of_words, (lane, np.maximum(place, 0)), np.where((w == weight) & (place >= 0), posterior, 0.0))
         out[:, number] = of_words / of_words.sum(axis=1, keepdims=True)
-    return out.reshape(*shape, -1)
-
-
-@cache
-def _n_lit() -> NDArray[np.int64]:
-    """(1024,) number of lit slots of a word."""
-    return np.asarray(slot_patterns(SLOTS_PER_SYMBOL - 1).sum(axis=1), np.int64)
+    return out
 
 
 @cache

@@ -293,7 +293,7 @@ def test_a_packet_of_a_clip_that_misses_a_slot_is_not_whole() -> None:
     clock, n_observed = clock_of(60, 0, [0, 0]), np.ones((2, 50), np.int64)
     n_observed[0, 30] = 0
     posteriors = posteriors_of([5, 5], indices([5, 5]))
-    burst = confidence.BurstInClip(0, 0, posteriors, n_observed, (3,), None, np.zeros(2, np.float32))
+    burst = confidence.BurstInView(0, 0, posteriors, n_observed, (3,), None, np.zeros(2, np.float32))
     first, second = assemble.clip_results(
         assemble.FrameColumns(clock, snr(60), np.zeros(2, bool), 0.0), [burst], lambda _: False
     )
@@ -304,7 +304,7 @@ def test_a_packet_of_a_clip_that_misses_a_slot_is_not_whole() -> None:
 
 def test_a_probability_that_was_rounded_up_is_one() -> None:
     clock, posteriors = clock_of(60, 0, [0, 0]), posteriors_of([5, 5], indices([5, 5]))
-    burst = confidence.BurstInClip(0, 0, posteriors, np.ones((2, 50), np.int64), (3,), None, np.zeros(2, np.float32))
+    burst = confidence.BurstInView(0, 0, posteriors, np.ones((2, 50), np.int64), (3,), None, np.zeros(2, np.float32))
     packets = [
         assemble.clip_results(
             assemble.FrameColumns(clock, snr(60), np.zeros(2, bool), 0.0, framing=np.array([framing])),

@@ -14,7 +14,7 @@ from rxcli.receiver.light import exposed_from
 from rxcli.types import BurstSamples
 
 Q, STRIPS = 2, 4
-EVERY_PATH = msgspec.structs.replace(SURVIVORS, max_paths=2000, max_lag=1e6)
+EVERY_PATH = msgspec.structs.replace(SURVIVORS, max_paths=2000)
 
 
 def packet(index: NDArray[np.int64], w: int) -> NDArray[np.int64]:
@@ -108,11 +108,11 @@ def path_log_likelihood(burst: BurstSamples, slots: NDArray[np.int64]) -> float:
             error = burst.light[n, place, 0] - a * picture
             spread = a * a * variance + noise
             total += float((-np.log(spread) / 2 - (nu + 1) / 2 * np.log1p(error**2 / spread / nu)).sum())
-            jump = np.clip((nu + error**2 / spread) / (nu + 1), 1, settings.max_jump)
+            jump = np.maximum((nu + error**2 / spread) / (nu + 1), 1)
             variance = np.minimum(variance * jump, settings.max_variance * picture**2)
             gain = a * variance / (a * a * variance + noise)
-            picture = np.clip(picture + gain * error, settings.min_picture, settings.max_picture)
-            variance = np.maximum(variance * (1 - gain * a), settings.min_variance)
+            picture = np.clip(picture + gain * error, 1 / settings.max_picture, settings.max_picture)
+            variance = np.maximum(variance * (1 - gain * a), 0)
     return settings.information / Q * total
 
 
@@ -155,7 +155,7 @@ def test_few_paths_are_enough_and_packets_beat_arbitrary_slots() -> None:
     rng = np.random.default_rng(10)
     index = rng.integers(0, 128, (4, 5))
     burst = samples([packet(i, 5) for i in index], 4.0, rng, 0.02, 0.05)
-    few, many = detect(burst), detect(burst, msgspec.structs.replace(SURVIVORS, max_paths=300, max_lag=80))
+    few, many = detect(burst), detect(burst, msgspec.structs.replace(SURVIVORS, max_paths=300))
     assert np.array_equal(few.index, many.index)
     assert (few.log_evidence > free_log_evidence(burst)).all()
     other = rng.integers(0, 2, (4, 80)).astype(np.int64)
