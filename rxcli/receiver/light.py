@@ -147,9 +147,21 @@ def exposed_from(exposure_slots: float, samples_per_slot: int) -> FloatArray:
         samples_per_slot: samples per slot, Q; a sample is a mean over its own length.
     """
     length = max(exposure_slots, _MIN_WIDTH)
-    start = (np.arange(samples_per_slot)[:, None] + (np.arange(_FINE) + 0.5) / _FINE) / samples_per_slot
-    slots = np.arange(np.ceil(length) + 1)
-    return np.asarray(exposure_shares(start[..., None] + length / 2, slots, length).mean(axis=1))
+    return _taps(length / 2, np.arange(np.ceil(length) + 1), length, samples_per_slot)
+
+
+def _taps(start: float, slots: FloatArray, exposure_slots: float, samples_per_slot: int) -> FloatArray:
+    """(Q, slots) weight of slots in the samples of a slot that begins with the middle of an exposure at `start`."""
+    fine = (np.arange(samples_per_slot * _FINE) + 0.5) / (samples_per_slot * _FINE)
+    centre = start + fine.reshape(samples_per_slot, _FINE, 1)
+    return np.asarray(exposure_shares(centre, slots, max(exposure_slots, _MIN_WIDTH)).mean(axis=1))
+
+
+def light_through(taps: FloatArray, lit: Float32Array, before: int = 0) -> Float32Array:
+    """(C, (N + before) * Q) light of slots (C, N) by weights (Q, n) of those from `before` earlier on; 0.5 beyond."""
+    padded = np.pad(lit, ((0, 0), (before, taps.shape[1] - 1)), constant_values=0.5)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, taps.shape[1], axis=1)
+    return np.asarray((windows @ taps.T.astype(np.float32)).reshape(len(lit), -1), np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,13 +184,7 @@ class Exposure:
         """
         # Odd, so that metrics lie between samples; the slots at both ends are hardly exposed.
         isi_memory = int(np.clip(2 * np.ceil((exposure_slots - _MEMORY_SLOTS) / 2) + 1, 1, _MAX_MEMORY))
-        q = samples_per_slot
-        # A sample is a mean over its own length.
-        offsets = ((np.arange(_FINE) + 0.5) / _FINE - 0.5) / q
-        centres = -isi_memory / 2 + (np.arange(q) + 0.5) / q
-        fine = (centres[:, None] + offsets)[:, None, :]
-        slots = np.arange(-isi_memory, 1)[:, None]
-        return Exposure(exposure_shares(fine, slots, max(exposure_slots, _MIN_WIDTH)).mean(axis=2))
+        return Exposure(_taps(-isi_memory / 2, np.arange(-isi_memory, 1.0), exposure_slots, samples_per_slot))
 
     @property
     def isi_memory(self) -> int:
@@ -192,16 +198,8 @@ class Exposure:
 
     def mean_light(self, lit: Float32Array) -> Float32Array:
         """(C, N * Q) mean of slots (C, N), or of their probabilities, over the exposure; 0.5 beyond the ends."""
-        (n_columns, n_slots), isi_memory, q = lit.shape, self.isi_memory, self.samples_per_slot
-        padded = np.full((n_columns, n_slots + 2 * isi_memory), 0.5, np.float32)
-        padded[:, isi_memory : isi_memory + n_slots] = lit
-        n_metrics = n_slots + isi_memory
-        repeated = np.repeat(padded, q, axis=1)
-        out = np.zeros((n_columns, n_metrics * q), np.float32)
-        for place, weights in enumerate(self.taps.T.astype(np.float32)):
-            out += repeated[:, place * q :][:, : n_metrics * q] * np.tile(weights, n_metrics)
-        skip = isi_memory * q // 2
-        return np.ascontiguousarray(out[:, skip : skip + n_slots * q])
+        skip, n = self.isi_memory * self.samples_per_slot // 2, lit.shape[1] * self.samples_per_slot
+        return np.ascontiguousarray(light_through(self.taps, lit, self.isi_memory)[:, skip : skip + n])
 
 
 def column_light(n_strips: int, n_columns: int, light_spread: float) -> FloatArray:
@@ -251,18 +249,19 @@ class Crosstalk:
         return self.shares[None, :, 1, None].astype(np.float32)
 
     def from_neighbours(
-        self, light: Float32Array, columns: NDArray[np.int64], ahead: FloatArray | None = None
+        self, light: Float32Array, columns: NDArray[np.int64], delays: FloatArray | None = None
     ) -> Float32Array:
         """(len(columns), S, n) light of the adjacent columns in each strip of some columns.
 
         Args:
             light: (C, n) of all columns.
             columns: numbers of the columns.
-            ahead: (C - 1,) delay of each column against the previous one, samples; None for no delays.
+            delays: (C,) of the columns, samples; none by default.
         """
         left, right = np.zeros_like(light), np.zeros_like(light)
         left[1:], right[:-1] = light[:-1], light[1:]
-        if ahead is not None:
+        if delays is not None and delays.any():
+            ahead = np.diff(delays)
             left[1:], right[:-1] = _shifted(left[1:], ahead), _shifted(right[:-1], -ahead)
         shares = self.shares.astype(np.float32)
         return left[columns, None] * shares[None, :, 0, None] + right[columns, None] * shares[None, :, 2, None]

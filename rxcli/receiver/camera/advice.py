@@ -43,7 +43,7 @@ def why_not(strips: ColumnStrips) -> str:
 
 def stripe_likeness(strips: ColumnStrips) -> tuple[FloatArray, BoolArray]:
     """Correlation of neighbouring strips in bands of rows, 0..1; and whether a band is lit."""
-    level = levelled(strips.light, strips.inside, SETTINGS.likeness_rows)
+    level = levelled(strips.light, strips.inside, strips.rows.size // SETTINGS.likeness_bands)
     blocks = np.linspace(0, strips.rows.size, SETTINGS.likeness_bands + 1).astype(int)[:-1]
 
     def summed(values: Float32Array) -> FloatArray:

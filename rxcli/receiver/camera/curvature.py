@@ -38,7 +38,7 @@ def likeliest_bend(strips: ColumnStrips, level: Float32Array) -> FloatArray:
     strips_per_column = level.shape[0] // strips.n_columns
     level = np.ascontiguousarray(level[::strips_per_column])
     moved = _moved_rows(strips, strips_per_column, UNIT_BEND)
-    bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, 16)
+    bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, SETTINGS.n_bends)[1::2]
     straight = (_moved(level, np.float32(size) * moved) for size in bends)
     return np.asarray(bends[np.argmax([(light[:-1] * light[1:]).sum() for light in straight])] * UNIT_BEND)
 

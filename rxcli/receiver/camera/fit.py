@@ -62,7 +62,9 @@ def settle(
         exposure, exposure_sd = model.exposure(start, exposure)
         exposure = max(exposure, least)
     values, covariance, near = model.fit(start, exposure, np.append(straight, bent) if may_bend else straight)
-    if may_bend and _chi_square(values[2:], covariance[2:, 2:]) < SETTINGS.bent_chi_square:
+    # Four coefficients more have to explain more than chance does (Bayesian information criterion).
+    n_independent = model.strips.light.size / SETTINGS.samples_per_independent
+    if may_bend and _chi_square(values[2:], covariance[2:, 2:]) < bent.size * np.log(n_independent):
         values, covariance, near = model.fit(values * (np.arange(values.size) < 2), exposure, straight)
     if near.explained < SETTINGS.min_explained:
         return hypothesis, 0.0

@@ -89,7 +89,7 @@ def propose_slots(strips: ColumnStrips, *, may_bend: bool = True) -> list[Camera
     coarse, level, width = _coarse(strips)
     if width <= 0:
         return []
-    n_bends = SETTINGS.n_line_bends if may_bend else 1
+    n_bends = SETTINGS.n_bends if may_bend else 1
     bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, n_bends) if may_bend else np.zeros(1)
     curvatures = bends[:, None] * UNIT_BEND
     found = [_strongest_line(coarse, level, curvature, width) for curvature in curvatures]
@@ -154,7 +154,7 @@ def stripe_rows(strips: ColumnStrips) -> float:
     Neighbours have no noise in common. Texture that is wider than the stripes counts as well, so that levels follow
     what was found.
     """
-    width = float(SETTINGS.first_width_rows)
+    width = SETTINGS.rows_per_width
     for _ in range(SETTINGS.width_rounds):
         level = levelled(strips.light, strips.inside, round(SETTINGS.level_widths * width))
         width = _half_width(_autocorrelation(level[:-1:2], level[1::2]))
@@ -356,18 +356,18 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
     """
     import cv2
 
-    black = SETTINGS.dark_share * float(np.percentile(strips.light, SETTINGS.dark_percent))
+    black = np.percentile(strips.light, SETTINGS.dark_percent)
     light = np.log(np.maximum(strips.light - np.float32(black), np.float32(SETTINGS.min_light)))
     found: list[tuple[float, float]] = []
-    for lag in SETTINGS.bend_lags:
-        nearest, furthest = (int(slots * lag) for slots in SETTINGS.exposure_lags)
+    for lag in SETTINGS.turn_lags:
+        fewest, most = (lag * lags for lags in SETTINGS.slot_lags)
+        nearest, furthest = int(LONG_EXPOSURE_SLOTS * fewest), int(MAX_EXPOSURE_SLOTS * most)
         if light.shape[1] < 2 * furthest:
             continue
         smooth = local_mean(light, max(lag // 2, 1))
         turn = smooth[:, 2 * lag :] - 2 * smooth[:, lag:-lag] + smooth[:, : -2 * lag]
         turn /= np.median(np.abs(turn), axis=1, keepdims=True) + np.float32(TINY)
-        most = np.float32(SETTINGS.max_bend_ratio)
-        turn = np.clip(turn, -most, most)
+        turn = np.clip(turn, -SETTINGS.max_turn, SETTINGS.max_turn)
         n = turn.shape[1]
         columns, turns = (part.reshape(strips.n_columns, -1, n).mean(axis=1) for part in (turn, np.abs(turn)))
         columns = _own_light(columns)
@@ -382,7 +382,7 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
         frequency = np.arange(spectrum.size) / size
         # The mosaic shows as periods of two and of four rows.
         mosaic = np.minimum(np.abs(frequency - 0.25), np.abs(frequency - 0.5)) < SETTINGS.mosaic_line
-        inside = (frequency > 1 / (7 * lag)) & (frequency < 1 / (1.6 * lag)) & ~mosaic
+        inside = (frequency > 1 / most) & (frequency < 1 / fewest) & ~mosaic
         peaks = _peaks(np.where(inside, spectrum, 0.0), SETTINGS.n_peaks, 2 * _FINE)
         found += [(float(spectrum[round(peak)]), size / peak) for peak in peaks.tolist() if peak > 0]
     distinct: list[tuple[float, float]] = []

@@ -8,19 +8,16 @@ class EstimateSettings(msgspec.Struct, frozen=True):
 
     #: Strips that a column keeps.
     strips_per_column: int = 2
-    #: Variance of light that is nothing but rounding.
-    min_variance: float = 1e-10
     #: Limit of levelled light, standard deviations.
     bounded_sigmas: float = 3.0
     #: Root mean square of levelled light that is nothing but rounding.
     min_soft_sign: float = 0.02
 
-    #: Half width of the columns' autocorrelation before anything is known, rows; and rounds of estimating it.
-    first_width_rows: int = 4
+    #: Rounds of estimating the half width of the columns' autocorrelation.
     width_rounds: int = 3
     #: Window of the levels, in half widths of the stripes.
     level_widths: float = 16.0
-    #: Rows that a half width keeps when rows are joined.
+    #: Rows that a half width has before anything is known, and that it keeps when rows are joined.
     rows_per_width: float = 4.0
     #: Half width of the autocorrelation, slots: from the shortest exposures to those of three slots.
     half_width_slots: tuple[float, float] = (0.45, 1.8)
@@ -37,9 +34,10 @@ class EstimateSettings(msgspec.Struct, frozen=True):
     n_peaks: int = 4
     #: Maximum weight of the slots' line, log-likelihood.
     max_line: float = 30.0
-    #: Strength of the slots' line that noise reaches in one of ten pictures, ln(10 * 2000 bins); bends it is sought on.
+    #: Strength of the slots' line that noise reaches in one of ten pictures, ln(10 * 2000 bins).
     min_slot_line: float = 9.9
-    n_line_bends: int = 25
+    #: Bends that are tried by the slots' line, the middle one none; by the likeness of columns, every second.
+    n_bends: int = 25
     #: Clocks this close, relative, are one; hypotheses that are proposed; and the score that further ones need, as most
     #: of noise have 30 to 45, and right ones 60 and more where a whole packet is in view.
     same_clock: float = 4e-3
@@ -52,13 +50,12 @@ class EstimateSettings(msgspec.Struct, frozen=True):
     exposure_step: float = 0.1
     #: Least strength of a line that is looked at, as a share of the strongest.
     min_line_share: float = 0.5
-    #: Exposures that are looked for, in the lags of bends.
-    exposure_lags: tuple[float, float] = (3.7, 66.0)
-    #: Rows over which bends of the light are taken; limit of a bend, in medians.
-    bend_lags: tuple[int, ...] = (1, 2, 4, 8)
-    max_bend_ratio: float = 4.0
-    #: Black level, as a share of a percentile of the light; least light above it.
-    dark_share: float = 0.8
+    #: Rows over which turns of the light are taken, and rows a slot for which each lag serves, in lags; limit of a
+    #: turn, in medians.
+    turn_lags: tuple[int, ...] = (1, 2, 4, 8)
+    slot_lags: tuple[float, float] = (1.6, 7.0)
+    max_turn: float = 4.0
+    #: Percentile of the light that counts as black; least light above it.
     dark_percent: float = 0.5
     min_light: float = 1e-4
     #: Bins around a line that it is compared with; distance of the mosaic's line, cycles a row.
@@ -81,14 +78,11 @@ class EstimateSettings(msgspec.Struct, frozen=True):
     min_explained: float = 0.1
     #: Ratio of errors to the scatter of the columns' contributions, since neighbours share their light.
     sd_scale: float = 1.6
-    #: Chi-square of the four coefficients from which stripes are bent beyond doubt.
-    bent_chi_square: float = 40.0
 
-    #: Rows over which light is levelled to compare strips; likeness of neighbouring strips, 0..1, below which a band of
-    #: rows has no stripes; bands; share of them that must have stripes.
-    likeness_rows: int = 100
-    striped_likeness: float = 0.25
+    #: Bands of rows, whose strips are compared; likeness of neighbouring strips, 0..1, below which a band has no
+    #: stripes; share of bands that must have stripes.
     likeness_bands: int = 16
+    striped_likeness: float = 0.25
     striped_share: float = 0.7
 
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import TINY
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.light import NoiseModel
 from rxcli.types import Float32Array, FloatArray, RowProfiles
@@ -99,7 +100,7 @@ def levelled(light: Float32Array, inside: Float32Array, window: int) -> Float32A
     power, left, right = (cv2.blur(change * factor, size) / share for factor in (change, beside[:-2], beside[2:]))
     signal = np.clip(np.maximum(left, right), 0, power)
     sigmas = np.float32(SETTINGS.bounded_sigmas)
-    doubt = signal + sigmas * sigmas * (power - signal) + np.float32(SETTINGS.min_variance)
+    doubt = signal + sigmas * sigmas * (power - signal) + np.float32(TINY)
     level = np.clip(change / np.sqrt(doubt), -sigmas, sigmas)
     return np.asarray(level * (signal / doubt * inside), np.float32)
 

@@ -94,31 +94,15 @@ def network_inputs(scene: DenoiserInput, columns: NDArray[np.int64]) -> tuple[Fl
     Returns:
         (B, S, 26, N) features of the strips, and (B, 16, N) of the columns; float32.
     """
-    observed = _residuals(scene, columns)
-    return _strip_features(scene, observed, columns), _column_features(scene, observed, columns)
-
-
-@dataclass(frozen=True, slots=True)
-class _Residuals:
-    """Light, prediction and residual of some columns given the current slots, (B, S, n) float32."""
-
-    #: Light above the black level; 0 where nothing is visible.
-    light: Float32Array
-    #: Predicted light of the neighbours and of the column itself, per unit of picture.
-    expected: Expected
-    #: Inverse standard deviation of the residual; 0 where nothing is visible.
-    scale: Float32Array
-    #: Contribution of a lit slot, and residual, both in standard deviations.
-    contrast: Float32Array
-    residual: Float32Array
-
-
-def _residuals(scene: DenoiserInput, columns: NDArray[np.int64]) -> _Residuals:
     model, valid = scene.model, scene.samples.valid[columns]
     light = model.over_black(scene.samples)[columns]
     expected = model.expected(scene.lit, scene.clock, columns)
     residual, scale, picture = _residual(light, valid, expected.whole, model.noise, scene.samples.samples_per_slot)
-    return _Residuals(light, expected, scale, picture * expected.own * scale, residual)
+    residual = np.clip(residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS)
+    # Light of a lit slot, in units of the limit of residuals.
+    contrast = np.minimum(picture * expected.own * scale / np.float32(_RESIDUAL_SIGMAS), np.float32(2))
+    of_strips = _strip_features(scene, columns, light, expected, residual, contrast)
+    return of_strips, _column_features(scene, columns, residual, contrast)
 
 
 def _residual(
@@ -149,10 +133,17 @@ def _row_light(residual: Float32Array, scale: Float32Array) -> Float32Array:
     return np.asarray(mean * np.float32(power) / (np.float32(power) + error), np.float32)
 
 
-def _strip_features(scene: DenoiserInput, observed: _Residuals, columns: NDArray[np.int64]) -> Float32Array:
-    """(B, S, 26, N) features of strips, see `STRIP_FEATURES`."""
-    q, sigma = scene.samples.samples_per_slot, np.float32(max(scene.model.noise.sigma, TINY))
-    valid, light, expected = scene.samples.valid[columns], observed.light, observed.expected
+def _strip_features(
+    scene: DenoiserInput,
+    columns: NDArray[np.int64],
+    light: Float32Array,
+    expected: Expected,
+    residual: Float32Array,
+    contrast: Float32Array,
+) -> Float32Array:
+    """(B, S, 26, N) features of strips, see `STRIP_FEATURES`, from (B, S, n) values."""
+    q, noise, valid = scene.samples.samples_per_slot, scene.model.noise, scene.samples.valid[columns]
+    sigma = np.float32(max(noise.sigma, TINY))
     level = np.maximum(mean_of_valid(light, valid, SLOTS_PER_SYMBOL * q), 0)
     base = np.float32(0.02) * level + 2 * sigma
     middle = scene.model.crosstalk.against_middle()
@@ -162,16 +153,19 @@ def _strip_features(scene: DenoiserInput, observed: _Residuals, columns: NDArray
         np.log((np.maximum(light, 0) + base) / (level + base)),
         expected.neighbours * part,
         expected.own * part * expected.shape,
-        np.clip(observed.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS),
-        _contrast_feature(observed.contrast),
+        residual,
+        contrast,
     )
     shape = (*light.shape[:2], -1, q)
     out = np.empty((*light.shape[:2], N_STRIP_FEATURES, light.shape[-1] // q), np.float32)
     for number, values in enumerate(by_sample):
         out[:, :, number * q : (number + 1) * q] = np.moveaxis(values.reshape(shape), -1, 2)
+    level = level.reshape(shape)[..., 0]
     by_slot = (
         valid.reshape(shape).mean(axis=-1),
-        *_noise_features(level.reshape(shape)[..., 0], sigma, np.float32(scene.model.noise.shot_gain)),
+        # Noise of a dark and of an average sample relative to the level, decades.
+        np.log10(sigma / (level + sigma)),
+        np.log10(np.sqrt(sigma * sigma + np.float32(noise.shot_gain) * level) / (level + sigma)),
         middle,
         np.float32(scene.clock.exposure_slots),
         _known_slots(scene.clock),
@@ -181,34 +175,26 @@ def _strip_features(scene: DenoiserInput, observed: _Residuals, columns: NDArray
     return out
 
 
-def _column_features(scene: DenoiserInput, observed: _Residuals, columns: NDArray[np.int64]) -> Float32Array:
-    """(B, 16, N) features of columns, see `COLUMN_FEATURES`."""
+def _column_features(
+    scene: DenoiserInput, columns: NDArray[np.int64], residual: Float32Array, contrast: Float32Array
+) -> Float32Array:
+    """(B, 16, N) features of columns, see `COLUMN_FEATURES`, from (B, S, n) values."""
     q, clock = scene.samples.samples_per_slot, scene.clock
     lit = np.clip(scene.lit[columns], _MIN_DOUBT, 1 - _MIN_DOUBT)
     llr = slot_llr(scene.metrics[columns], lit)
-    contrast = _contrast_feature(observed.contrast)
+    # Slope of a Student-t log-density with four degrees of freedom, which limits outliers.
+    pull = residual / (1 + residual * residual / np.float32(4))
     place = clock.places % SLOTS_PER_SYMBOL
     by_slot = (
         _known_slots(clock),
         *(np.arange(SLOTS_PER_SYMBOL)[:, None] == place),
         *(np.clip(values / 4, -3, 3) for values in (llr, np.log(lit / (1 - lit)) - llr)),
         scene.w[columns, None] / SLOTS_PER_SYMBOL,
-        np.clip(
-            _pooled(_bounded(np.clip(observed.residual, -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS)) * contrast, q), -4, 4
-        ),
+        np.clip(_pooled(pull * contrast, q), -_RESIDUAL_SIGMAS, _RESIDUAL_SIGMAS),
         np.log1p(_pooled(contrast * contrast, q)),
     )
     shape = (columns.size, clock.n_slots)
     return np.stack([np.broadcast_to(values, shape) for values in by_slot], axis=1).astype(np.float32)
-
-
-def _contrast_feature(contrast: Float32Array) -> Float32Array:
-    return np.asarray(np.minimum(contrast, np.float32(2 * _RESIDUAL_SIGMAS)) / np.float32(_RESIDUAL_SIGMAS))
-
-
-def _bounded(residual: Float32Array) -> Float32Array:
-    """Slope of a Student-t log-density with four degrees of freedom, which limits outliers."""
-    return np.asarray(residual / (1 + residual * residual / np.float32(4)))
 
 
 def _pooled(values: NDArray[np.floating[Any]], q: int) -> Float32Array:
@@ -216,12 +202,6 @@ def _pooled(values: NDArray[np.floating[Any]], q: int) -> Float32Array:
     return np.asarray(
         values.sum(axis=1).reshape(values.shape[0], -1, q).sum(axis=2) * np.float32(SETTINGS.slot_information / q)
     )
-
-
-def _noise_features(level: Float32Array, sigma: np.float32, shot_gain: np.float32) -> tuple[Float32Array, Float32Array]:
-    """Noise of a dark and of an average sample relative to the level, decades."""
-    whole = level + sigma
-    return np.log10(sigma / whole), np.log10(np.sqrt(sigma * sigma + shot_gain * level) / whole)
 
 
 def _known_slots(clock: Clock) -> Float32Array:
@@ -254,6 +234,10 @@ class Contract(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     columns: str = "columns"
     correction: str = "correction"
 
+    def __post_init__(self) -> None:
+        if (self.strip_features, self.column_features) != (STRIP_FEATURES, COLUMN_FEATURES):
+            raise ValueError("the model wants other features than this receiver makes")
+
 
 class ModelCard(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """`model.toml`: description, training recipe and figures of a model."""
@@ -283,36 +267,20 @@ def load_denoiser(name_or_path: str = DEFAULT_MODEL) -> OnnxDenoiser:
     shipped = data_dir("models") / name_or_path
     is_name = re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name_or_path) is not None
     folder = shipped if is_name and shipped.is_dir() else Path(name_or_path)
-    card = _read_card(folder / "model.toml")
-    return OnnxDenoiser(card, _read_weights(folder / card.file, card))
-
-
-def _read_card(path: Path) -> ModelCard:
-    hint = "install the package again, or name a folder made by vlc-rx train"
+    path, hint = folder / "model.toml", "install the package again, or name a folder made by vlc-rx train"
     try:
         card = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), ModelCard, strict=True)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not text"
-        raise ProfileError(f"{path}: no model can be read there ({reason})", hint) from None
-    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-        raise ProfileError(f"{path}: not a model card ({error})", hint) from None
-    wanted = (STRIP_FEATURES, COLUMN_FEATURES)
-    if (card.contract.strip_features, card.contract.column_features) != wanted:
-        raise ProfileError(f"{path}: the model wants other features than this receiver makes", hint)
-    return card
-
-
-def _read_weights(path: Path, card: ModelCard) -> bytes:
-    hint = "install the package again, or export the model again with vlc-rx train"
-    try:
-        data = path.read_bytes()
+        path = folder / card.file
+        weights = path.read_bytes()
     except OSError as error:
-        raise ProfileError(f"{path}: cannot be read ({error.strerror})", hint) from None
+        raise ProfileError(f"{path}: no model can be read there ({error.strerror})", hint) from None
+    except ValueError as error:  # No text, no TOML or no card.
+        raise ProfileError(f"{path}: not a model card ({error})", hint) from None
     import hashlib  # loads OpenSSL, which pictures without columns in doubt do without
 
-    if hashlib.sha256(data).hexdigest() != card.sha256:
+    if hashlib.sha256(weights).hexdigest() != card.sha256:
         raise ProfileError(f"{path}: does not match the checksum in model.toml; it is cut or of another model", hint)
-    return data
+    return OnnxDenoiser(card, weights)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import TINY, box_sums
+from rxcli.numerics import TINY, mean_of_valid
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, sees_dark_header
@@ -43,14 +43,13 @@ class ObservationModel:
             columns: numbers of the columns.
             slope: whether to compute the derivative by time too.
         """
-        ahead = np.diff(clock.delay_slots) * self.exposure.samples_per_slot if clock.delay_slots.any() else None
-        shape = self.exposure.mean_light(lit)
-        neighbours, own = self.crosstalk.from_neighbours(shape, columns, ahead), self.crosstalk.own
+        shape, delays = self.exposure.mean_light(lit), clock.delay_slots * self.exposure.samples_per_slot
+        neighbours, own = self.crosstalk.from_neighbours(shape, columns, delays), self.crosstalk.own
         if not slope:
             return Expected(neighbours, own, shape[columns, None], None)
         change = np.zeros_like(shape)
         change[:, 1:-1] = (shape[:, 2:] - shape[:, :-2]) * np.float32(self.exposure.samples_per_slot / 2)
-        changes = self.crosstalk.from_neighbours(change, columns, ahead) + own * change[columns, None]
+        changes = self.crosstalk.from_neighbours(change, columns, delays) + own * change[columns, None]
         return Expected(neighbours, own, shape[columns, None], changes)
 
     def over_black(self, samples: SlotSamples) -> Float32Array:
@@ -113,10 +112,9 @@ def estimate_tails(
     if columns.size < _MIN_COLUMNS:
         return 0.0, 0.0
     around, valid = SLOTS_PER_SYMBOL * samples.samples_per_slot, samples.valid[columns]
-    count = np.maximum(box_sums(valid, around), 1)
 
     def over_mean(light: Float32Array) -> tuple[Float32Array, Float32Array]:
-        mean = np.asarray(box_sums(light * valid, around) / count, np.float32)
+        mean = mean_of_valid(light * valid, valid, around)
         return np.asarray(light / np.maximum(mean, np.float32(TINY)), np.float32), mean
 
     shown, mean = over_mean(model.over_black(samples)[columns])

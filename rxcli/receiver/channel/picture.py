@@ -82,7 +82,6 @@ def predict_picture(sums: PictureSums, noise_floor: float, scales: tuple[int, ..
     dark_variance, margin = np.float32(noise_floor), PER_SLOT * max(scales) + 1
     around = np.stack([in_time(sums.cross), in_time(sums.power)])
     around = np.pad(around, [(0, 0)] * 3 + [(2, margin)])
-    texture = _Texture(sums, dark_variance)
     best: Prediction | None = None
     for scale in scales:
         light, observed = _sides(around, PER_SLOT * scale, sums.cross.shape[-1], one_sided)
@@ -90,7 +89,7 @@ def predict_picture(sums: PictureSums, noise_floor: float, scales: tuple[int, ..
         observed += _MIN_POWER
         picture /= observed
         # The scale is chosen once per slot.
-        variance = np.square(picture[:, 1]) * texture.of(picture)
+        variance = np.square(picture[:, 1]) * _texture(picture, sums, dark_variance)
         variance += dark_variance / observed[:, 1]
         if best is None:
             best = Prediction(picture, variance)
@@ -129,30 +128,14 @@ def _sides(around: Float32Array, size: int, n_slots: int, one_sided: bool) -> Fl
     return out
 
 
-class _Texture:
-    """Local relative variance of a prediction, beyond the noise."""
-
-    def __init__(self, sums: PictureSums, dark_variance: np.float32) -> None:
-        self._sums = sums
-        self._light = sums.light.sum(axis=0)
-        self._twice = 2 * sums.cross
-        #: Contribution of noise to the error.
-        self._noise = dark_variance * _around(sums.count.sum(axis=0)) + np.float32(TINY)
-
-    def of(self, picture: Float32Array) -> Float32Array:
-        """(sides, C, S, N) relative variance of `picture` (sides, 2, C, S, N)."""
-        shown = picture * self._sums.power
-        left = shown - self._twice
-        left *= picture
-        shown *= picture
-        error = left[:, 0] + left[:, 1]
-        error += self._light
-        error = _around(error)
-        error -= self._noise
-        error /= _around(shown[:, 0] + shown[:, 1]) + self._noise
-        return np.clip(error, np.float32(SETTINGS.min_texture), np.float32(2), out=error)
-
-
-def _around(values: Float32Array) -> Float32Array:
-    """Sums over the slots at most a symbol away."""
-    return box_sums(values, SLOTS_PER_SYMBOL)
+def _texture(picture: Float32Array, sums: PictureSums, dark_variance: np.float32) -> Float32Array:
+    """(sides, C, S, N) local relative variance of a prediction (sides, 2, C, S, N), beyond the noise."""
+    shown = picture * sums.power
+    left = shown - 2 * sums.cross
+    left *= picture
+    shown *= picture
+    error = box_sums(left[:, 0] + left[:, 1] + sums.light.sum(axis=0), SLOTS_PER_SYMBOL)
+    noise = dark_variance * box_sums(sums.count.sum(axis=0), SLOTS_PER_SYMBOL) + np.float32(TINY)
+    error -= noise
+    error /= box_sums(shown[:, 0] + shown[:, 1], SLOTS_PER_SYMBOL) + noise
+    return np.clip(error, np.float32(SETTINGS.min_texture), np.float32(2), out=error)

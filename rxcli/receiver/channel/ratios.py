@@ -10,7 +10,7 @@ from rxcli.numerics import mean_of_valid
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.model import ObservationModel
 from rxcli.receiver.channel.settings import SETTINGS
-from rxcli.receiver.light import Crosstalk, exposed_from
+from rxcli.receiver.light import Crosstalk, exposed_from, light_through
 from rxcli.types import BurstSamples, Clock, Float32Array, IntArray, SlotSamples
 
 
@@ -36,9 +36,8 @@ def burst_samples(
     mean = mean_of_valid(above, samples.valid, SLOTS_PER_SYMBOL * q) if samples.level is None else samples.level
     mean = np.maximum(mean, np.float32(SETTINGS.min_level_sigmas * model.noise.sigma))
     light = np.asarray(above / mean, np.float32)
-    ahead = np.diff(clock.delay_slots) * q if clock.delay_slots.any() else None
-    own = own_light(light) if lit is None else light_of_slots(lit, clock.exposure_slots, q)
-    neighbours = model.crosstalk.from_neighbours(own, columns, ahead)
+    own = own_light(light) if lit is None else light_through(exposed_from(clock.exposure_slots, q), lit)
+    neighbours = model.crosstalk.from_neighbours(own, columns, clock.delay_slots * q)
     light, mean, valid = light[columns], mean[columns], samples.valid[columns]
     variance = model.noise.variance(above[columns]) / np.square(mean)
     variance += np.square(light) * np.float32(SETTINGS.relative_error**2)
@@ -81,14 +80,6 @@ def own_light(light: Float32Array) -> Float32Array:
 
 def whole_light(lit: Float32Array, clock: Clock, crosstalk: Crosstalk, samples_per_slot: int) -> Float32Array:
     """(C, S, N * Q) light of all columns in their strips per unit of picture, by the start of exposures."""
-    ahead = np.diff(clock.delay_slots) * samples_per_slot if clock.delay_slots.any() else None
-    own = light_of_slots(lit, clock.exposure_slots, samples_per_slot)
-    return crosstalk.from_neighbours(own, np.arange(len(lit)), ahead) + crosstalk.own * own[:, None]
-
-
-def light_of_slots(lit: Float32Array, exposure_slots: float, samples_per_slot: int) -> Float32Array:
-    """(C, N * Q) share of lit slots (C, N) in exposures by their start; 0.5 beyond the end."""
-    taps = exposed_from(exposure_slots, samples_per_slot)
-    padded = np.pad(lit, ((0, 0), (0, taps.shape[1] - 1)), constant_values=0.5)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, taps.shape[1], axis=1)
-    return np.asarray((windows @ taps.T.astype(np.float32)).reshape(len(lit), -1), np.float32)
+    own = light_through(exposed_from(clock.exposure_slots, samples_per_slot), lit)
+    delays = clock.delay_slots * samples_per_slot
+    return crosstalk.from_neighbours(own, np.arange(len(lit)), delays) + crosstalk.own * own[:, None]

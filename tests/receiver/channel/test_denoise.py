@@ -294,7 +294,7 @@ def replace_weights(model: Path, data: bytes) -> None:
     ("damage", "told"),
     [
         (shutil.rmtree, r"no model can be read there.*vlc-rx train"),
-        (lambda model: (model / "model.onnx").unlink(), r"model\.onnx: cannot be read"),
+        (lambda model: (model / "model.onnx").unlink(), r"model\.onnx: no model can be read there"),
         (lambda model: (model / "model.onnx").write_bytes(b"cut"), "does not match the checksum"),
     ],
 )

@@ -29,6 +29,8 @@ class Response:
     centre: float = 1.0
     side: float = 0.0
     offset: float = 0.0
+    #: Lateness of the clock that was fitted with them, slots.
+    late: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,9 +1,8 @@
 """Response of camera and compression to exposed slots, fitted in every frame."""
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from rxcli.numerics import TINY
 from rxcli.receiver.channel.known_picture.exposure import Response
 from rxcli.receiver.channel.known_picture.picture import ColumnLight
 from rxcli.receiver.channel.known_picture.settings import SETTINGS
@@ -17,16 +16,7 @@ _SAMPLES_OF_RESPONSE, _GOLDEN = 2000, 0.6180339887
 _BOUNDS = np.transpose(SETTINGS.response_bounds)
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """Fitted response of a frame."""
-
-    response: Response
-    #: Lateness of the clock, slots.
-    late: float
-
-
-def fit_response(observed: ColumnLight, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Fit:
+def fit_response(observed: ColumnLight, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Response:
     """Fit the response of a frame by least squares over all columns, on a sufficient number of rows.
 
     Args:
@@ -47,11 +37,10 @@ def fit_response(observed: ColumnLight, lit: Float32Array, positions: FloatArray
     parts = parts.reshape(len(parts), -1)
     value, precision = (values.take(rows, axis=1).ravel() for values in (observed.value, observed.precision))
     weighted = parts * precision
-    weight = float(precision.sum()) + 1e-9
+    weight = float(precision.sum()) + TINY
     normal, right = weighted @ parts.T / weight, weighted @ value / weight
     # Regularised towards no blur.
     fitted = np.linalg.solve(normal + SETTINGS.response_ridge * np.eye(len(normal)), right - normal[:, 0])
     fitted[0] += 1
     fitted[3] /= max(fitted[0] + 2 * fitted[1], SETTINGS.response_bounds[0][0])
-    *response, late = np.clip(fitted, *_BOUNDS).tolist()
-    return Fit(Response(*response), late)
+    return Response(*np.clip(fitted, *_BOUNDS).tolist())
