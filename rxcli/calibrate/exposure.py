@@ -69,17 +69,15 @@ def _from_wave(
     wave = ((profile - fit.mean) / np.where(usable, fit.envelope, 1))[usable]
     phase = np.asarray((fit.frequency * (fit.first_row + np.flatnonzero(usable) - fit.origin)) % 1, np.float64)
     start = _start(phase, wave)
-    if start is None:
+    shape = None if start is None else least_squares(lambda state: _trapezoid(phase, state) - wave, start)
+    total = max(float(np.sum((wave - wave.mean()) ** 2)), 1e-300)
+    if shape is None or 1 - float(np.sum(shape.residual**2)) / total < _MIN_EXPLAINED:
         return ExposureEstimate(None, None, "the lamp is not switched on and off sharply, or the picture is too noisy")
-    shape = least_squares(lambda state: _trapezoid(phase, state) - wave, start)
     rise, fall, edge = (float(value) for value in shape.state[:3])
     edge, lit = abs(edge), (fall - rise) % 1
     covariance = shape.covariance()
     edge_sd = float(np.sqrt(covariance[2, 2]))
     lit_sd = float(np.sqrt(max(covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1], 0)))
-    unexplained = float(np.sum(shape.residual**2)) / max(float(np.sum((wave - wave.mean()) ** 2)), 1e-300)
-    if 1 - unexplained < _MIN_EXPLAINED:
-        return ExposureEstimate(None, None, "the lamp is not switched on and off sharply, or the picture is too noisy")
     if edge > _MAX_EDGE or min(lit, 1 - lit) - edge < _MIN_PLATEAU:
         return ExposureEstimate(None, None, "the stripes have no plateaus; use a slower lamp or a shorter exposure")
     period_s = line_delay_s / fit.frequency

@@ -67,6 +67,12 @@ def weighted_mean(values: ArrayLike, sds: ArrayLike) -> tuple[float, float]:
     return mean, float(np.sqrt(max(scatter, 1.0) / weights.sum()))
 
 
+def grid_points(size: tuple[int, int], counts: tuple[int, int]) -> FloatArray:
+    """(n, 2) positions all over a picture of width and height `size`, pixels; `counts` across and down."""
+    x, y = np.meshgrid(*(np.linspace(0, side - 1, n) for side, n in zip(size, counts, strict=True)))
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
 def fit_distortion(
     rays: FloatArray, points: FloatArray, focal: ArrayLike, centre: ArrayLike, size: tuple[int, int]
 ) -> tuple[LensModel, float]:

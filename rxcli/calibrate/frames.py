@@ -2,9 +2,8 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from rxcli.types import Float32Array, Frame, Mosaic
+from rxcli.types import Float32Array, Frame
 
 _GREEN = 1
 
@@ -18,18 +17,14 @@ def frame_light(frame: Frame) -> Float32Array:
     pixels = frame.pixels.astype(np.float32)
     if frame.mosaic is not None:
         black, white = frame.mosaic.black[_GREEN], frame.mosaic.white
-        green = (_colours(frame.mosaic, *frame.pixels.shape) == _GREEN).astype(np.float32)
+        pattern = frame.mosaic.pattern
+        rows, columns = (np.arange(n) % period for n, period in zip(pixels.shape, pattern.shape, strict=True))
+        green = (pattern[np.ix_(rows, columns)] == _GREEN).astype(np.float32)
         green[~green.any(axis=1)] = 1
-        window = (2 * frame.mosaic.pattern.shape[1] - 1, 1)
+        window = (2 * pattern.shape[1] - 1, 1)
         total, count = (cv2.boxFilter(part, -1, window, normalize=False) for part in (pixels * green, green))
         return np.asarray(np.clip((total / count - black) / (white - black), 0, None), np.float32)
     values = np.clip((pixels - np.float32(frame.black)) / np.float32(frame.white - frame.black), 0, None)
     if frame.linear:
         return np.asarray(values, np.float32)
     return np.asarray(np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4), np.float32)
-
-
-def _colours(mosaic: Mosaic, height: int, width: int) -> NDArray[np.uint8]:
-    """(height, width) colour of each pixel."""
-    rows, columns = mosaic.pattern.shape
-    return np.tile(mosaic.pattern, (height // rows + 1, width // columns + 1))[:height, :width]

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.calibrate.fitting import fit_distortion
+from rxcli.calibrate.fitting import fit_distortion, grid_points
 from rxcli.errors import InputError, ProfileError
+from rxcli.ingest.metadata import positive, text_of
 from rxcli.profiles import LensModel
 from rxcli.resources import read_limited
 from rxcli.types import FloatArray
@@ -24,7 +25,7 @@ _MAX_BYTES = 4 << 20
 _GRID = (33, 21)
 #: Angle from the axis above which no screen is flat enough to be read.
 _MAX_ANGLE_RAD = math.radians(70)
-#: Angles at which the fisheye polynomial is tabulated; linear interpolation is then right to 1e-8.
+#: Angles at which the fisheye polynomial is tabulated, where OpenCV's iteration misses steep ones.
 _ANGLES = 10_000
 _HINT = "use `vlc-rx calibrate lens`, or another profile"
 
@@ -71,7 +72,7 @@ def load_gyroflow(path: Path, size: tuple[int, int] | None = None) -> GyroflowPr
     matrix[1, 2] += (size[1] - calibrated[1] * scale) / 2
     rays, points = _rays(matrix, coefficients, size, path)
     lens, worst = fit_distortion(rays, points, matrix[[0, 1], [0, 1]], matrix[:2, 2], size)
-    make, model, lens_name = (_text(raw, key) for key in ("camera_brand", "camera_model", "lens_model"))
+    make, model, lens_name = (text_of(raw.get(key)) or "" for key in ("camera_brand", "camera_model", "lens_model"))
     return GyroflowProfile(lens, make, model, lens_name, worst, *_readout(raw))
 
 
@@ -98,7 +99,7 @@ def _calibrated(raw: dict[str, Any]) -> tuple[FloatArray, FloatArray, tuple[int,
     matrix = np.array(fisheye["camera_matrix"], np.float64).reshape(3, 3)
     coefficients = np.array(fisheye["distortion_coeffs"], np.float64).reshape(4)
     # Anamorphic pictures are stored narrower, or lower, than they were calibrated.
-    stretch = [_positive(raw.get(f"input_{side}_stretch")) or 1.0 for side in ("horizontal", "vertical")]
+    stretch = [positive(raw.get(f"input_{side}_stretch")) or 1.0 for side in ("horizontal", "vertical")]
     width, height = (round(int(dimension[side]) / part) for side, part in zip("wh", stretch, strict=True))
     finite = np.all(np.isfinite(matrix)) and np.all(np.isfinite(coefficients))
     if not (finite and min(matrix[0, 0], matrix[1, 1]) > 0 and 0 < width <= 100_000 and 0 < height <= 100_000):
@@ -111,8 +112,7 @@ def _rays(
     matrix: FloatArray, coefficients: FloatArray, size: tuple[int, int], path: Path
 ) -> tuple[FloatArray, FloatArray]:
     """Rays (n, 2), x and y at depth 1, of points over the picture, and the points (n, 2) in focal lengths."""
-    x, y = np.meshgrid(np.linspace(0, size[0] - 1, _GRID[0]), np.linspace(0, size[1] - 1, _GRID[1]))
-    points = (np.column_stack([x.ravel(), y.ravel()]) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    points = (grid_points(size, _GRID) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
     radius = np.linalg.norm(points, axis=1)
     angles = np.linspace(0, _MAX_ANGLE_RAD, _ANGLES)
     radii = angles * np.polynomial.polynomial.polyval(angles**2, [1, *coefficients])
@@ -129,8 +129,8 @@ def _readout(raw: dict[str, Any]) -> tuple[float | None, bool, tuple[str, ...]]:
     if raw.get("global_shutter") is True:
         return None, False, ("the profile states a global shutter, which produces no stripes",)
     stated, direction = raw.get("frame_readout_time"), raw.get("frame_readout_direction")
-    rate = _positive(raw.get("fps"))
-    value = _positive(abs(stated)) if isinstance(stated, (int, float)) and not isinstance(stated, bool) else None
+    rate = positive(raw.get("fps"))
+    value = positive(abs(stated)) if isinstance(stated, (int, float)) and not isinstance(stated, bool) else None
     if value is None or stated is None:
         return None, False, ("the profile states no readout",)
     if direction in ("LeftToRight", "RightToLeft"):
@@ -143,13 +143,3 @@ def _readout(raw: dict[str, Any]) -> tuple[float | None, bool, tuple[str, ...]]:
     if upwards:
         notes.append("the profile states a readout from the bottom to the top")
     return value * 1e-3, upwards, tuple(notes)
-
-
-def _positive(value: Any) -> float | None:
-    good = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value) and value > 0
-    return float(value) if good else None
-
-
-def _text(raw: dict[str, Any], key: str) -> str:
-    value = raw.get(key)
-    return "".join(letter for letter in value if letter.isprintable()).strip() if isinstance(value, str) else ""

@@ -85,7 +85,10 @@ class LensCalibration:
     @property
     def uncovered(self) -> tuple[str, ...]:
         """Names of the parts of the picture without corners."""
-        return uncovered_parts(self.corners, self.model.width, self.model.height)
+        covered = covered_parts(self.corners, self.model.width, self.model.height)
+        rows = ("top", "upper", "middle", "lower", "bottom")
+        columns = ("left", "centre left", "centre", "centre right", "right")
+        return tuple(f"{rows[y]} {columns[x]}" for y, x in np.argwhere(~covered))
 
 
 def find_board(image: GrayImage, board: Board, name: str) -> Sighting | Rejected:
@@ -261,11 +264,3 @@ def covered_parts(corners: FloatArray, width: int, height: int) -> BoolArray:
     covered = np.zeros((5, 5), dtype=bool)
     covered[down, across] = True
     return covered
-
-
-def uncovered_parts(corners: FloatArray, width: int, height: int) -> tuple[str, ...]:
-    """Names of the parts of the picture that hold no corners (n, 2), pixels."""
-    covered = covered_parts(corners, width, height)
-    rows = ("top", "upper", "middle", "lower", "bottom")
-    columns = ("left", "centre left", "centre", "centre right", "right")
-    return tuple(f"{rows[y]} {columns[x]}" for y, x in np.argwhere(~covered))

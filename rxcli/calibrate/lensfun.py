@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.calibrate.fitting import fit_distortion
+from rxcli.calibrate.fitting import fit_distortion, grid_points
 from rxcli.errors import ProfileError, UsageError
 from rxcli.profiles import LensModel
 from rxcli.types import Metadata
@@ -60,8 +60,7 @@ def lens_from_database(metadata: Metadata, width: int, height: int) -> LensfunMo
         raise ProfileError(f"lensfun holds no distortion of {lens.model} at {focal_mm:g} mm", "use `calibrate lens`")
     modifier = lensfunpy.Modifier(lens, camera.crop_factor, width, height)
     modifier.initialize(focal_mm, 8.0, 10.0, scale=1.0, flags=lensfunpy.ModifyFlags.DISTORTION)
-    x, y = np.meshgrid(np.linspace(0, width - 1, _GRID[0]), np.linspace(0, height - 1, _GRID[1]))
-    undistorted = np.column_stack([x.ravel(), y.ravel()])
+    undistorted = grid_points((width, height), _GRID)
     distorted = np.array([modifier.apply_geometry_distortion(*point, 1, 1)[0, 0] for point in undistorted.tolist()])
     focal_px = focal_mm * camera.crop_factor / _FULL_FRAME_DIAGONAL_MM * float(np.hypot(width, height))
     centre = np.array([width - 1, height - 1]) / 2

@@ -32,125 +32,97 @@ Directory = list[Entry]
 _ENDLESS = (0, 1, 1 << 62, b"")
 
 
-def claims_too_much(file: BinaryIO) -> bool:
-    """Whether the directories of a TIFF-like file claim more values than the file can hold; False for other files."""
-    try:
-        head = file.read(16)
-        if head[:2] not in (b"II", b"MM") or head[2:4] not in (*_CLASSIC, *_BIG):
-            return False
-        length = file.seek(0, 2)
-        entries = (entry for directory in _directories(file, head).values() for entry in directory)
-        claimed = (n * _SIZES.get(kind, 0) for _, kind, n, _ in entries)
-        return sum(claimed) > length + _SHARED_BYTES
-    except (OSError, OverflowError, ValueError):
-        return False
-    finally:
+class Directories:
+    """The directories of a TIFF-like file, nested ones too, up to the first broken one; none of other files."""
+
+    def __init__(self, file: BinaryIO) -> None:
         file.seek(0)
+        head = file.read(16)
+        self._file, self._order = file, "<" if head[:2] == b"II" else ">"
+        #: By the place in the file.
+        self._found: dict[int, Directory] = {}
+        if head[:2] in (b"II", b"MM") and head[2:4] in (*_CLASSIC, *_BIG):
+            with suppress(struct.error, OSError, OverflowError, ValueError):  # of a cut file, offsets beyond all files
+                self._read(head, head[2:4] in _BIG)
 
-
-def bytes_claimed(file: BinaryIO) -> int:
-    """Minimum length in bytes of a RAW file by its own directories; 0 if they do not determine it."""
-    head = file.read(128)
-    if head.startswith(b"FUJIFILMCCD-RAW") and len(head) >= 108:
-        offset, length = struct.unpack_from(">II", head, 100)
-        return int(offset + length)
-    if head[:4] in (b"II*\0", b"MM\0*"):
-        return max((_end(file, directory, _order(head)) for directory in _directories(file, head).values()), default=0)
-    return 0
-
-
-def tags_of(file: BinaryIO) -> tuple[dict[int, Any], dict[int, Any]]:
-    """Values of the first directory of a TIFF-like file and of its EXIF directory, by tag; empty where they are broken.
-
-    Numbers, bytes, or tuples of several numbers.
-    """
-    head = file.read(16)
-    if head[:2] not in (b"II", b"MM"):
-        return {}, {}
-    directories, order = _directories(file, head), _order(head)
-    main = next(iter(directories.values()), [])
-    exif = [entry for at in _values(file, main, _EXIF, order)[:1] for entry in directories.get(at, [])]
-    of_main, of_exif = ({entry[0]: _value(file, entry, order) for entry in part} for part in (main, exif))
-    return of_main, of_exif
-
-
-def values_of(file: BinaryIO, tag: int) -> set[int]:
-    """Values of a tag in all directories of a TIFF-like file."""
-    head = file.read(16)
-    if head[:2] not in (b"II", b"MM"):
-        return set()
-    directories = _directories(file, head).values()
-    return {value for directory in directories for value in _values(file, directory, tag, _order(head))}
-
-
-def _end(file: BinaryIO, directory: Directory, order: str) -> int:
-    """End of the last strip or tile of a directory, bytes."""
-    values = {tag: _values(file, directory, tag, order) for pair in _PARTS for tag in pair}
-    ends = [a + n for at, size in _PARTS for a, n in zip(values[at], values[size], strict=False)]
-    return max(ends, default=0)
-
-
-def _order(head: bytes) -> str:
-    return "<" if head[:2] == b"II" else ">"
-
-
-def _directories(file: BinaryIO, head: bytes) -> dict[int, Directory]:
-    """The directories of a TIFF-like file by their places, including nested ones, up to the first broken one."""
-    found: dict[int, Directory] = {}
-    with suppress(struct.error):
-        order, big = _order(head), head[2:4] in _BIG
-        count, entry, offset = (order + form for form in (("Q", "HHQ8s", "Q") if big else ("H", "HHI4s", "I")))
+    def _read(self, head: bytes, big: bool) -> None:
+        count, entry, offset = (self._order + form for form in (("Q", "HHQ8s", "Q") if big else ("H", "HHI4s", "I")))
         waiting = [(struct.unpack_from(offset, head, 8 if big else 4)[0], True)]
-        while waiting and len(found) < _MAX_DIRECTORIES:
+        while waiting and len(self._found) < _MAX_DIRECTORIES:
             at, in_chain = waiting.pop(0)
-            if not at or at in found:
+            if not at or at in self._found:
                 continue
-            file.seek(at)
-            (n_entries,) = struct.unpack(count, file.read(struct.calcsize(count)))
+            self._file.seek(at)
+            (n_entries,) = struct.unpack(count, self._file.read(struct.calcsize(count)))
             if n_entries > _MAX_ENTRIES:
-                found[at] = [_ENDLESS]
+                self._found[at] = [_ENDLESS]
                 continue
-            found[at] = directory = list(struct.iter_unpack(entry, file.read(n_entries * struct.calcsize(entry))))
-            following = file.read(struct.calcsize(offset))
-            waiting += [(place, False) for tag in _POINTERS for place in _values(file, directory, tag, order)]
+            content = self._file.read(n_entries * struct.calcsize(entry))
+            self._found[at] = directory = list(struct.iter_unpack(entry, content))
+            following = self._file.read(struct.calcsize(offset))
+            waiting += [(place, False) for tag in _POINTERS for place in self._values(directory, tag)]
             # What follows a directory of EXIF or GPS is no pointer: some cameras write none there.
             if in_chain and len(following) == struct.calcsize(offset):
                 waiting.append((struct.unpack(offset, following)[0], True))
-    return found
 
+    @property
+    def claims_too_much(self) -> bool:
+        """Whether they claim more values than the file can hold."""
+        claimed = (n * _SIZES.get(kind, 0) for directory in self._found.values() for _, kind, n, _ in directory)
+        return sum(claimed) > self._file.seek(0, 2) + _SHARED_BYTES
 
-def _values(file: BinaryIO, directory: Directory, wanted: int, order: str) -> tuple[int, ...]:
-    """The offsets or lengths of a tag; none where it is absent or absurd."""
-    for entry in directory:
-        if entry[0] == wanted and entry[1] in _TYPES:
-            return _numbers(_content(file, entry, order), order + _TYPES[entry[1]])
-    return ()
+    @property
+    def end(self) -> int:
+        """End of the last strip or tile that they state, bytes; 0 if they state none."""
+        values = [[self._values(d, tag) for tag in pair] for d in self._found.values() for pair in _PARTS]
+        return max((a + n for at, size in values for a, n in zip(at, size, strict=False)), default=0)
 
+    def tags(self) -> tuple[dict[int, Any], dict[int, Any]]:
+        """Values of the first directory and of its EXIF directory, by tag; empty where they claim too much.
 
-def _value(file: BinaryIO, entry: Entry, order: str) -> Any:
-    """The value of an entry as `tags_of` gives it."""
-    kind, data = entry[1], _content(file, entry, order)
-    if kind in _NUMBERS:
-        numbers: tuple[float, ...] = _numbers(data, order + _NUMBERS[kind])
-    elif kind in _FRACTIONS:
-        parts = _numbers(data, order + _FRACTIONS[kind])
-        numbers = tuple(above / below if below else nan for above, below in zip(parts[::2], parts[1::2], strict=True))
-    else:
-        return data
-    return numbers[0] if len(numbers) == 1 else numbers
+        Numbers, bytes, or tuples of several numbers.
+        """
+        if self.claims_too_much:
+            return {}, {}
+        main = next(iter(self._found.values()), [])
+        exif = [entry for at in self._values(main, _EXIF)[:1] for entry in self._found.get(at, [])]
+        of_main, of_exif = ({entry[0]: self._value(entry) for entry in part} for part in (main, exif))
+        return of_main, of_exif
 
+    def values(self, tag: int) -> set[int]:
+        """Values of a tag in all directories."""
+        return {value for directory in self._found.values() for value in self._values(directory, tag)}
 
-def _numbers(data: bytes, form: str) -> tuple[int, ...]:
-    return tuple(number for (number,) in struct.iter_unpack(form, data))
+    def _values(self, directory: Directory, wanted: int) -> tuple[int, ...]:
+        """The offsets or lengths of a tag; none where it is absent or absurd."""
+        entries = (entry for entry in directory if entry[0] == wanted and entry[1] in _TYPES)
+        return next((self._numbers(entry, _TYPES) for entry in entries), ())
 
+    def _value(self, entry: Entry) -> Any:
+        """The value of an entry as `tags` gives it."""
+        if entry[1] in _NUMBERS:
+            numbers: tuple[float, ...] = self._numbers(entry, _NUMBERS)
+        elif entry[1] in _FRACTIONS:
+            parts = self._numbers(entry, _FRACTIONS)
+            numbers = tuple(
+                above / below if below else nan for above, below in zip(parts[::2], parts[1::2], strict=True)
+            )
+        else:
+            return self._content(entry)
+        return numbers[0] if len(numbers) == 1 else numbers
 
-def _content(file: BinaryIO, entry: Entry, order: str) -> bytes:
-    """The bytes of an entry's value; none where they are cut or absurd."""
-    _, kind, n, field = entry
-    size = n * _SIZES.get(kind, 0)
-    if size > _MAX_VALUES_BYTES:
-        return b""
-    if size > len(field):
-        file.seek(int.from_bytes(field, "little" if order == "<" else "big"))
-        field = file.read(size)
-    return field[:size] if len(field) >= size else b""
+    def _numbers(self, entry: Entry, forms: dict[int, str]) -> tuple[int, ...]:
+        content = struct.iter_unpack(self._order + forms[entry[1]], self._content(entry))
+        return tuple(number for (number,) in content)
+
+    def _content(self, entry: Entry) -> bytes:
+        """The bytes of an entry's value; none where they are cut or absurd."""
+        _, kind, n, field = entry
+        size = n * _SIZES.get(kind, 0)
+        if size > _MAX_VALUES_BYTES:
+            return b""
+        if size > len(field):
+            with suppress(OSError, OverflowError):
+                self._file.seek(int.from_bytes(field, "little" if self._order == "<" else "big"))
+                field = self._file.read(size)
+        return field[:size] if len(field) >= size else b""

@@ -11,7 +11,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -20,15 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError
-from rxcli.ingest.extent import claims_too_much
+from rxcli.ingest.extent import Directories
 from rxcli.ingest.luma import BT601, Luma, Weights, colours_of, luma_of
 from rxcli.ingest.metadata import exif_metadata, jpeg_metadata, tiff_metadata
 from rxcli.ingest.quiet import quiet_libraries
 from rxcli.ingest.sniff import Kind, check_size, damage_explained, read_bytes
 from rxcli.types import Frame, Metadata
-
-#: Pillow's are left out: sizes are checked here, and broken directories do no harm.
-_no_warnings = partial(warnings.catch_warnings, action="ignore")
 
 
 def read_image(path: Path, kind: Kind) -> Frame:
@@ -101,7 +97,7 @@ def _read_tiff(path: Path) -> Frame:
 
     logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)  # what matters comes as an exception
     with path.open("rb") as file:
-        if claims_too_much(file):
+        if Directories(file).claims_too_much:
             raise InputError(f"{path}: the TIFF's directories claim more than the file holds", "copy it again")
         metadata = tiff_metadata(file)
     with damage_explained(f"{path}: the TIFF is damaged or cut", "copy it again"), tifffile.TiffFile(path) as tiff:
@@ -194,7 +190,7 @@ def _read_with_pillow(data: bytes, path: Path) -> tuple[NDArray[np.uint8], Metad
 
     with (
         damage_explained(f"{path}: the picture is damaged", "copy the file again"),
-        _no_warnings(),
+        warnings.catch_warnings(action="ignore"),  # sizes are checked here, and broken directories do no harm
         Image.open(io.BytesIO(data), formats=("BMP", "WEBP")) as image,
     ):
         check_size(path, *image.size, 18, len(data))  # measured: WebP without loss takes most

@@ -12,7 +12,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rxcli.ingest.extent import claims_too_much, tags_of, values_of
+from rxcli.ingest.extent import Directories
 from rxcli.ingest.jpeg import segments
 from rxcli.ingest.sniff import RAW_SUFFIXES
 from rxcli.types import Metadata
@@ -60,18 +60,18 @@ def exif_metadata(exif: bytes) -> Metadata:
 
 def tiff_metadata(stream: BinaryIO) -> Metadata:
     """Metadata of a TIFF or TIFF-like RAW file; only its directories are read."""
-    return _from_tags(*_load_directories(stream))
+    return _from_tags(*Directories(stream).tags())
 
 
 def is_raw_tiff(path: Path) -> bool:
     """Whether a TIFF file is a camera's RAW in TIFF clothes: a DNG, a mosaic, or a preview with its RAW further on."""
     has_raw_name = path.suffix.lower() in RAW_SUFFIXES
     with path.open("rb") as file:
-        tags, _ = _load_directories(file)
-        if not tags:
-            return has_raw_name
-        file.seek(0)
-        has_raw_samples = not values_of(file, _PHOTOMETRIC).isdisjoint(_RAW_PHOTOMETRICS)
+        directories = Directories(file)
+        tags, _ = directories.tags()
+        has_raw_samples = not directories.values(_PHOTOMETRIC).isdisjoint(_RAW_PHOTOMETRICS)
+    if not tags:
+        return has_raw_name
     return _DNG_VERSION in tags or has_raw_samples or (_MAKE in tags and has_raw_name)
 
 
@@ -89,7 +89,7 @@ def clip_metadata(tags: Mapping[str, str]) -> Metadata:
     lower = {name.lower(): value for name, value in tags.items()}
 
     def text(*names: str) -> str | None:
-        return next((found for name in names if (found := _text(lower.get(name)))), None)
+        return next((found for name in names if (found := text_of(lower.get(name)))), None)
 
     return Metadata(
         make=text("make", "com.apple.quicktime.make", "com.android.manufacturer"),
@@ -131,29 +131,17 @@ def _raw_metadata(file: BinaryIO) -> Metadata:
     return tiff_metadata(file)
 
 
-def _load_directories(stream: BinaryIO) -> tuple[Tags, Tags]:
-    """First and EXIF directory as plain dictionaries, empty where they are broken."""
-    stream.seek(0)
-    if claims_too_much(stream):
-        return {}, {}
-    stream.seek(0)
-    try:
-        return tags_of(stream)
-    except (OSError, OverflowError, ValueError):  # of offsets beyond all files
-        return {}, {}
-
-
 def _from_tags(main: Tags, exif: Tags) -> Metadata:
     def number(*tags: int) -> float | None:
-        values = (_positive(directory.get(tag)) for tag in tags for directory in (exif, main))
+        values = (positive(directory.get(tag)) for tag in tags for directory in (exif, main))
         return next((value for value in values if value is not None), None)
 
     iso = number(_SENSITIVITY)
     return believed(
         Metadata(
-            make=_text(main.get(_MAKE)),
-            model=_text(main.get(_MODEL)),
-            lens=_text(exif.get(_LENS_MODEL)),
+            make=text_of(main.get(_MAKE)),
+            model=text_of(main.get(_MODEL)),
+            lens=text_of(exif.get(_LENS_MODEL)),
             exposure_s=number(_EXPOSURE),
             iso=number(_ISO_SPEED, _RECOMMENDED_INDEX, _SENSITIVITY) if iso == _ISO_OVERFLOW else iso,
             focal_length_mm=number(_FOCAL_LENGTH),
@@ -163,14 +151,16 @@ def _from_tags(main: Tags, exif: Tags) -> Metadata:
     )
 
 
-def _text(value: Any) -> str | None:
+def text_of(value: Any) -> str | None:
+    """What of a name in a file can be printed; None for no name."""
     if isinstance(value, bytes):
         value = value.decode("utf-8", "replace")
     text = value.split("\0")[0].strip() if isinstance(value, str) else ""
     return "".join(c for c in text[:_MAX_CHARACTERS] if c.isprintable()) or None
 
 
-def _positive(value: Any) -> float | None:
+def positive(value: Any) -> float | None:
+    """A number above zero in a file; None for anything else."""
     if isinstance(value, tuple):
         value = value[0] if value else None
     try:

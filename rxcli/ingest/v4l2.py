@@ -13,7 +13,7 @@ import os
 import select
 import time
 from collections.abc import Callable, Generator, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from fcntl import ioctl
 from functools import partial
@@ -188,13 +188,12 @@ class Camera:
         #: Number of the last frame that the driver gave, and when it came.
         self._sequence: int | None = None
         self._came_s = self._given_s = time.monotonic()
-        with _explained(path):
+        with _explained(path), ExitStack() as opened:
             self._descriptor = _open(path)
-            try:
-                self._configure()
-            except BaseException:
-                self.close()
-                raise
+            opened.callback(os.close, self._descriptor)  # stops the stream and frees its buffers, whatever its state
+            self._configure(opened)
+            #: Hand the device back; may be called again.
+            self.close = opened.pop_all().close
 
     def __iter__(self) -> Iterator[Frame | None]:
         with _explained(self._path):
@@ -214,17 +213,9 @@ class Camera:
                 elif silent_s > _POLL_S or self.counts.damaged > n_damaged:
                     yield None
 
-    def close(self) -> None:
-        """Hand the device back; may be called again."""
-        for view in self._maps:
-            view.close()
-        if self._descriptor >= 0:
-            os.close(self._descriptor)  # stops the stream and frees its buffers, whatever state it is in
-        self._descriptor = -1
-
     # -- setting up ---------------------------------------------------------------------------------------------------
 
-    def _configure(self) -> None:
+    def _configure(self, opened: ExitStack) -> None:
         self._card = _check_capture(self._descriptor, self._path)
         wanted = _choose(list(_modes(self._descriptor)), self._settings, self._path)
         self._form = _set_format(self._descriptor, wanted, self._path)
@@ -236,7 +227,7 @@ class Camera:
         for index in range(request.count):
             buffer = _buffer(index)
             ioctl(self._descriptor, api.VIDIOC_QUERYBUF, buffer)
-            self._maps.append(mmap.mmap(self._descriptor, buffer.length, offset=buffer.m.offset))
+            self._maps.append(opened.enter_context(mmap.mmap(self._descriptor, buffer.length, offset=buffer.m.offset)))
             self._give_back(buffer)
         ioctl(self._descriptor, api.VIDIOC_STREAMON, ctypes.c_int(_CAPTURE))
         self.counts.connections += 1

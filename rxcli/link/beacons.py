@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from operator import itemgetter
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +19,13 @@ from rxcli.link.placement import Placement, possible_placements
 from rxcli.link.softbits import LN2, MIN_SIMILARITY, TRY_FROM, Float32, log_likelihood, same_bits_llr, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
+_T = TypeVar("_T")
 #: Increase of information before the next attempt to decode a beacon, and the upper limit; relative to its bits.
 _RETRY_GAIN, _TRY_UP_TO = 0.08, 2.5
 #: Bits that must be observed, relative to the beacon's: the others may be known.
 _MIN_OBSERVED = 0.5
-_ITERATIONS = 40
 #: `MIN_SIMILARITY` of bits that a message sends twice within a burst: one symbol may be misread.
-MIN_REPEATED = -30.0
+_MIN_REPEATED = -30.0
 #: Log-likelihood ratio above which bursts are copies of each other.
 _COPIES = 8.0
 #: Minimum log-likelihood of a decoded word per bit, relative to ln 2: the CRC of a wrong word may fit by chance.
@@ -121,8 +122,8 @@ class BeaconSearch:
         self._shape = (payload_symbols, columns, 7)
         #: Rounds by period, latest last.
         self._rounds: dict[int, list[_Round]] = {period: [] for period in self._layouts}
-        self._fruitless = dict.fromkeys(self._layouts, 0)
-        self._waited = dict.fromkeys(self._layouts, 0)
+        #: Failed attempts in a row, and bursts since the last attempt.
+        self._fruitless = self._waited = 0
 
     def add(self, soft: FrameSoftBits, settled: Placement | None) -> list[tuple[tuple[MessageKind, bytes], Placement]]:
         """Add bursts and return the messages found with them, known ones included, with the placement of the columns.
@@ -176,55 +177,31 @@ class BeaconSearch:
         return candidate
 
     def _try(self, candidate: _Round, settled: Placement | None) -> None:
-        if candidate.found is not None or not self._worth_while(candidate):
+        self._waited += 1
+        # The bursts of most clips are no beacons and not similar.
+        is_late = self._fruitless < _FREE_TRIALS or self._waited >= min(self._fruitless, _MAX_PAUSE)
+        if candidate.found is not None or not (is_late or candidate.similarity() > _COPIES):
             return
-        n_observed, period = np.count_nonzero(candidate.total), len(candidate.total)
+        self._waited = 0
+        n_observed, level = np.count_nonzero(candidate.total), float(candidate.levels.sum())
         groups = possible_placements(candidate.total)
         if settled is not None:
             groups = [[settled.after(candidate.placement.inverse)]]
-        layouts = [layout for layout in self._layouts[period] if n_observed >= _MIN_OBSERVED * layout.code.k]
-        for number, layout, phase in product(range(len(groups)), layouts, range(period)):
-            for placement, found in self._tried(candidate, layout, phase, number, groups[number]):
-                candidate.settle(found, placement)
-                self._fruitless[period] = 0
+        layouts = [each for each in self._layouts[len(candidate.total)] if n_observed >= _MIN_OBSERVED * each.code.k]
+        for number, layout, phase in product(range(len(groups)), layouts, range(len(candidate.total))):
+            key, total = (layout.length, phase, number), np.roll(candidate.total, phase, axis=0)
+            last = candidate.tried.get(key, TRY_FROM - _RETRY_GAIN)
+            if last >= _TRY_UP_TO:
+                continue
+            totals = [placement.of(total) for placement in groups[number]]
+            bits, found = read_beacons(layout, totals, [level] * len(totals), min(last + _RETRY_GAIN, _TRY_UP_TO))
+            if bits:
+                candidate.tried[key] = bits
+                self._fruitless += 1
+            for place, content in found[:1]:
+                candidate.settle(content, groups[number][place])
+                self._fruitless = 0
                 return
-
-    def _worth_while(self, candidate: _Round) -> bool:
-        """Whether to attempt decoding: the bursts of most clips are no beacons and not similar."""
-        if candidate.similarity() > _COPIES or self._fruitless[len(candidate.total)] < _FREE_TRIALS:
-            return True
-        self._waited[len(candidate.total)] += 1
-        if self._waited[len(candidate.total)] < min(self._fruitless[len(candidate.total)], _MAX_PAUSE):
-            return False
-        self._waited[len(candidate.total)] = 0
-        return True
-
-    def _tried(
-        self, candidate: _Round, layout: BeaconLayout, phase: int, group: int, placements: Sequence[Placement]
-    ) -> Iterator[tuple[Placement, tuple[MessageKind, bytes]]]:
-        """Decode a candidate under a group of placements, and yield each one that gives a message."""
-        total, key = np.roll(candidate.total, phase, axis=0), (layout.length, phase, group)
-        last = candidate.tried.get(key, TRY_FROM - _RETRY_GAIN)
-        if last >= _TRY_UP_TO:
-            return
-        buffers = np.stack([gathered(layout, placement.of(total)) for placement in placements])
-        alone = float(candidate.levels.sum())
-        possible = np.flatnonzero([same_bits_llr(buffer, alone) >= MIN_REPEATED for buffer in buffers])
-        if possible.size == 0:
-            return
-        buffers = buffers[possible]
-        known = known_bits(layout, buffers)
-        bits = known.information(buffers) / layout.code.k
-        which = np.flatnonzero(bits >= min(last + _RETRY_GAIN, _TRY_UP_TO))
-        if which.size == 0:
-            return
-        candidate.tried[key] = float(bits[which].max())
-        self._fruitless[len(candidate.total)] += 1
-        words = read_words(layout, buffers[which], known=known.of(which))
-        for place, word in zip(possible[which].tolist(), words, strict=True):
-            found = None if word is None else unprotect_beacon(word)
-            if found is not None:
-                yield placements[place], found
 
 
 def gathered(layout: BeaconLayout, llr: Float32) -> Float32:
@@ -232,30 +209,64 @@ def gathered(layout: BeaconLayout, llr: Float32) -> Float32:
     return np.bincount(layout.places.ravel(), llr.ravel(), layout.n_bits).astype(np.float32)
 
 
+def read_beacons(
+    layout: BeaconLayout, totals: Sequence[Float32], levels: Sequence[float], min_information: float
+) -> tuple[float, list[tuple[int, tuple[MessageKind, bytes]]]]:
+    """Decode sums of soft bits as beacons of a layout, where bits that are sent twice agree.
+
+    Args:
+        layout: of the beacons.
+        totals: (P, N, C, 7) log-likelihood ratios of each.
+        levels: `surprise` of each, over all bits.
+        min_information: from which one is tried, relative to its bits.
+
+    Returns:
+        Largest information at an attempt, relative to the bits, 0 without any; and place and content of
+        each that is a message.
+    """
+    buffers = np.stack([gathered(layout, total) for total in totals])
+    possible = np.flatnonzero([same_bits_llr(*each) >= _MIN_REPEATED for each in zip(buffers, levels, strict=True)])
+    buffers = buffers[possible]
+    known = known_bits(layout, buffers)
+    bits = known.information(buffers) / layout.code.k
+    which = np.flatnonzero(bits >= min_information)
+    if which.size == 0:
+        return 0.0, []
+    words = read_words(layout.code, buffers[which], lambda _, word: unprotect_beacon(word), known.of(which))
+    found = [(place, word) for place, word in zip(possible[which].tolist(), words, strict=True) if word is not None]
+    return float(bits[which].max()), found
+
+
 def read_words(
-    layout: BeaconLayout,
-    buffers: Float32,
-    check: Callable[[bytes], object] = unprotect_beacon,
-    known: KnownBits | None = None,
-) -> list[bytes | None]:
-    """Decode buffers (n, n_bits) of a layout; None if no sufficiently likely word is found."""
+    code: ldpc.Code, buffers: Float32, check: Callable[[int, bytes], _T | None], known: KnownBits | None = None
+) -> list[_T | None]:
+    """Decode codewords.
+
+    Args:
+        code: the code.
+        buffers: (n, M) log-likelihood ratios of the first bits of the buffers.
+        check: returns the content of information bytes, given their place in the batch, or None if they are wrong.
+        known: what is known of their bits before.
+
+    Returns:
+        Content of each one; None if no sufficiently likely word is found.
+    """
     n_known = np.zeros(len(buffers)) if known is None else known.n_bits
     llr = buffers if known is None else buffers + known.sent
     unsent = None if known is None else ldpc.quantised(known.unsent)
-    found: list[bytes | None] = [None] * len(buffers)
+    found: list[_T | None] = [None] * len(buffers)
 
-    def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        good = np.zeros(places.size, bool)
-        for i, (place, coded) in enumerate(zip(places, np.packbits(bits, axis=1), strict=True)):
-            if check(coded.tobytes()) is not None and is_likely(layout, bits[i], buffers[place], n_known[place]):
-                found[place], good[i] = coded.tobytes(), True
-        return good
+    def accepted(place: int, bits: NDArray[np.uint8]) -> bool:
+        content = check(place, np.packbits(bits).tobytes())
+        if content is not None and is_likely(code, bits, buffers[place], n_known[place]):
+            found[place] = content
+        return found[place] is not None
 
-    ldpc.decode(layout.code, ldpc.quantised(llr), accepted, _ITERATIONS, gives_up=True, unsent_llr=unsent)
+    ldpc.decode(code, ldpc.quantised(llr), accepted, unsent_llr=unsent)
     return found
 
 
-def is_likely(layout: BeaconLayout, information_bits: NDArray[np.uint8], buffer: Float32, n_known: float = 0.0) -> bool:
+def is_likely(code: ldpc.Code, information_bits: NDArray[np.uint8], buffer: Float32, n_known: float = 0.0) -> bool:
     """Whether a decoded word agrees with the soft bits, from which its known bits do not follow."""
-    word = ldpc.encode(layout.code, np.asarray(information_bits, np.uint8)[None])[0, : buffer.size]
-    return bool(log_likelihood(word, buffer) > _MIN_LIKELIHOOD * (layout.code.k - n_known) * LN2)
+    word = ldpc.encode(code, information_bits[None])[0, : buffer.size]
+    return bool(log_likelihood(word, buffer) > _MIN_LIKELIHOOD * (code.k - n_known) * LN2)

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.link.beacons import MIN_REPEATED, gathered, read_words
-from rxcli.link.formats import unprotect_beacon
+from rxcli.link.beacons import gathered, read_beacons
 from rxcli.link.known_bits import known_bits
 from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
 from rxcli.link.placement import Placement, possible_placements
@@ -92,19 +91,9 @@ class CutPhotos:
 def _read(layout: BeaconLayout, sums: list[_Sum]) -> Iterator[tuple[tuple[MessageKind, bytes], _Sum]]:
     """Texts of a layout that sums show."""
     for start in range(0, len(sums), _BATCH):
-        gathering = ((gathered(layout, s.total[None]), s) for s in sums[start : start + _BATCH])
-        # Bits that are sent twice agree.
-        agreeing = [(b, s) for b, s in gathering if same_bits_llr(b, s.level) >= MIN_REPEATED]
-        if not agreeing:
-            continue
-        buffers, part = np.stack([b for b, _ in agreeing]), [s for _, s in agreeing]
-        known = known_bits(layout, buffers)
-        which = np.flatnonzero(known.information(buffers) > TRY_FROM * layout.code.k)
-        words = read_words(layout, buffers[which], known=known.of(which)) if which.size else []
-        for place, word in zip(which.tolist(), words, strict=True):
-            found = None if word is None else unprotect_beacon(word)
-            if found is not None:
-                yield found, part[place]
+        part = sums[start : start + _BATCH]
+        _, found = read_beacons(layout, [s.total[None] for s in part], [s.level for s in part], TRY_FROM)
+        yield from ((content, part[place]) for place, content in found)
 
 
 def _views(soft: FrameSoftBits) -> Iterator[_Sum]:

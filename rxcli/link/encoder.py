@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rxcli.errors import UsageError
 from rxcli.link import ldpc
-from rxcli.link.formats import Announcement, beacon_body, block_prefix, pack_container, protect, protect_beacon
+from rxcli.link.formats import Announcement, beacon_body, pack_container, protect_beacon, protect_block
 from rxcli.link.layout import (
     ANNOUNCEMENT_PERIOD,
     LABEL_BITS,
@@ -169,10 +169,7 @@ class FileSending:
         if self._coded is None:
             size = layout.block_bytes
             pieces = [self.container[i : i + size].ljust(size, b"\0") for i in range(0, len(self.container), size)]
-            blocks = [
-                protect(piece, self.object_id, number, block_prefix(self.object_id, number))
-                for number, piece in enumerate(pieces)
-            ]
+            blocks = [protect_block(piece, self.object_id, number) for number, piece in enumerate(pieces)]
             batches = (blocks[i : i + _BATCH] for i in range(0, len(blocks), _BATCH))
             coded = (ldpc.encode(layout.code, np.stack([*map(_bits, batch)]))[:, : layout.n_bits] for batch in batches)
             self._coded = np.concatenate([np.packbits(bits, axis=1) for bits in coded])

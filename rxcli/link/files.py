@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.link import ldpc, softbits
-from rxcli.link.beacons import gathered, is_likely, read_words
+from rxcli.link.beacons import gathered, read_words
 from rxcli.link.formats import (
     Announcement,
     Container,
     ContainerError,
-    block_prefix,
-    has_crc,
     unpack_container,
     unprotect_announcement,
+    unprotect_block,
 )
-from rxcli.link.layout import ANNOUNCEMENT_PERIOD, CRC_BYTES, LABEL_BITS, FileLayout, announcement_layout
+from rxcli.link.layout import ANNOUNCEMENT_PERIOD, FileLayout, announcement_layout
 from rxcli.link.placement import Placement, possible_placements
-from rxcli.link.sequences import whiten
-from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, information, log_likelihood, same_bits_llr, surprise
+from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, information, same_bits_llr, surprise
 from rxcli.types import FILE_MEMORY_MB, FrameSoftBits, ObjectProgress
 
 #: Batch size for announcements whose copies do not decide.
@@ -31,20 +30,16 @@ _ANNOUNCEMENTS_AT_ONCE = 32
 _MAX_SHIFTED = 96
 #: Blocks per batch, the share of the remaining blocks that suffices, and frames after which fewer suffice.
 _BLOCKS_AT_ONCE, _SHARE_AT_ONCE, _PATIENT_FRAMES = 32, 0.5, 30
-_ITERATIONS = 25
 #: Increase of information before the next attempt on a block, relative to its bits.
 _RETRY_GAIN = 0.02
-#: Files of at least this many blocks estimate the required information from this many first ones; and the share of
-#: decoded blocks in a batch below which the required information is raised.
-_LEARN_FROM, _PROBES, _FEW = 16, 8, 0.25
-#: Minimum log-likelihood of a decoded block, relative to the received information.
-_MIN_LIKELIHOOD = 0.5
-#: Bytes of bursts that wait for an announcement, and bursts that may be reassigned to a new object.
-_MAX_WAITING, _MAX_RECENT = 32 << 20, 96
+#: Share of decoded blocks in a batch below which the required information is raised.
+_FEW = 0.25
+#: Bytes of bursts that wait for an announcement.
+_MAX_OPEN = 32 << 20
 #: Largest accepted file, bytes.
 MAX_OBJECT_BYTES = 16 << 20
-#: Bytes of a file's state beside its sums, and maximum numbers of stored timelines and notes.
-_STATE_BYTES, _MAX_TIMELINES, _MAX_NOTES = 1 << 14, 16, 20
+#: Bytes of a file's state beside its sums, and maximum number of notes.
+_STATE_BYTES, _MAX_NOTES = 1 << 14, 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,39 +52,37 @@ class _Burst:
     llr: NDArray[np.int8]
 
 
-@dataclass(slots=True, eq=False)
 class FileState:
-    """Reception state of one file."""
+    """Reception state of one file.
 
-    announcement: Announcement
-    layout: FileLayout
-    #: (B, M) int8 sums of log-likelihood ratios in the decoder's steps.
-    total: NDArray[np.int8]
-    #: (B,) bits of information, and the threshold for decoding a block.
-    known: NDArray[np.float64]
-    threshold: NDArray[np.float64]
-    blocks: dict[int, bytes] = field(default_factory=dict)
-    #: Information at which blocks were decoded, relative to their bits.
-    read_at: list[float] = field(default_factory=list)
-    #: Minimum information for decoding any block, relative to its bits.
-    min_information: float = 0.0
-    done: bool = False
-    #: Reason why the file can never be complete.
-    failure: str | None = None
-    #: Whether the file was dropped to free memory; it restarts with the next announcement.
-    dropped: bool = False
-    frames_waited: int = 0
-    first_time_s: float | None = None
-    last_time_s: float = 0.0
+    Args:
+        announcement: of the file.
+        columns: C.
+        payload_symbols: N.
+    """
 
-    @classmethod
-    def begin(cls, announcement: Announcement, columns: int, payload_symbols: int) -> FileState:
-        """Start an empty file."""
-        layout = FileLayout(announcement.object_id, announcement.length, announcement.mother, columns, payload_symbols)
-        n = layout.n_blocks
-        # The operating system provides memory on first use, so a false length costs nothing.
-        total = np.zeros((n, layout.n_bits), np.int8)
-        return cls(announcement, layout, total, np.zeros(n), np.full(n, layout.ready))
+    def __init__(self, announcement: Announcement, columns: int, payload_symbols: int) -> None:
+        self.announcement = announcement
+        self.layout = FileLayout(
+            announcement.object_id, announcement.length, announcement.mother, columns, payload_symbols
+        )
+        n = self.layout.n_blocks
+        #: (B, M) int8 sums of log-likelihood ratios in the decoder's steps. The operating system provides memory on
+        #: first use, so a false length costs nothing.
+        self.total = np.zeros((n, self.layout.n_bits), np.int8)
+        #: (B,) bits of information, and the threshold for decoding a block; infinite once it is decoded.
+        self.known, self.threshold = np.zeros(n), np.full(n, self.layout.ready)
+        self.blocks: dict[int, bytes] = {}
+        #: Minimum information for decoding any block, bits.
+        self.min_information = 0.0
+        self.done = False
+        #: Reason why the file can never be complete.
+        self.failure: str | None = None
+        #: Whether the file was dropped to free memory; it restarts with the next announcement.
+        self.dropped = False
+        self.frames_waited = 0
+        self.first_time_s: float | None = None
+        self.last_time_s = 0.0
 
     @property
     def under_way(self) -> bool:
@@ -104,8 +97,6 @@ class FileState:
     @property
     def share(self) -> float:
         """Received share of the required information."""
-        if self.done:
-            return 1.0
         part = np.minimum(self.known / self.layout.ready, 0.999)
         part[list(self.blocks)] = 1.0
         return float(part.mean())
@@ -119,85 +110,40 @@ class FileState:
 
     def add(self, bursts: NDArray[np.int64], llr: NDArray[np.int8], sign: int = 1) -> None:
         """Add data bursts, numbered from the object's start; `sign` -1 removes them."""
-        blocks, labels, passes = (part.ravel() for part in self.layout.labels(bursts))
-        ratios = llr.reshape(-1, LABEL_BITS)
-        used = np.flatnonzero(ratios.any(axis=1) & self._open()[blocks])
-        block = blocks[used]
-        place = block[:, None] * self.layout.n_bits + self.layout.bits_of(labels[used], passes[used])
-        more = ratios[used].astype(np.int16) * sign
-        if not self.layout.all_differ(bursts):
-            place, turn = np.unique(place, return_inverse=True)
-            more = np.rint(np.bincount(turn.ravel(), more.ravel(), place.size)).astype(np.int16)
-            block = place // self.layout.n_bits
+        blocks, places = self.layout.places(bursts)
+        used = llr.any(axis=-1) & np.isfinite(self.threshold)[blocks]
+        place, turn = np.unique(blocks[used][:, None] * self.layout.n_bits + places[used], return_inverse=True)
+        more = sign * np.bincount(turn.ravel(), llr[used].ravel(), place.size)
         flat = self.total.reshape(-1)
         before = flat[place]
-        after = np.clip(before + more, -127, 127).astype(np.int8)
-        flat[place] = after
-        gain = (
-            softbits.INFORMATION_OF_STEPS[after.view(np.uint8)] - softbits.INFORMATION_OF_STEPS[before.view(np.uint8)]
+        flat[place] = after = np.clip(before + more, -127, 127).astype(np.int8)
+        gained, lost = (softbits.INFORMATION_OF_STEPS[steps.view(np.uint8)] for steps in (after, before))
+        self.known += np.bincount(place // self.layout.n_bits, gained - lost, self.layout.n_blocks)
+
+    def read_ready(self, at_last: bool) -> None:
+        """Decode blocks with enough information, several at once unless that takes long."""
+        more = _RETRY_GAIN * self.layout.code.k
+        threshold = self.threshold - 2 * more if at_last else np.maximum(self.threshold, self.min_information)
+        ready = np.flatnonzero(self.known >= threshold)
+        enough = min(_BLOCKS_AT_ONCE, _SHARE_AT_ONCE * (self.layout.n_blocks - len(self.blocks)))
+        if not at_last and self.frames_waited < _PATIENT_FRAMES and ready.size < enough:
+            return
+        for start in range(0, ready.size, _BLOCKS_AT_ONCE):
+            self._read(ready[start : start + _BLOCKS_AT_ONCE], more)
+
+    def _read(self, which: NDArray[np.int64], more: float) -> None:
+        """Decode blocks; where one fails, the next attempt takes `more` bits of information."""
+        self.frames_waited, numbers, object_id = 0, which.tolist(), self.layout.object_id
+        llr = self.total[which] * np.float32(ldpc.LLR_STEP)
+        found = read_words(
+            self.layout.code, llr, lambda place, coded: unprotect_block(coded, object_id, numbers[place])
         )
-        self.known += np.bincount(block, gain.reshape(block.size, -1).sum(axis=1), self.layout.n_blocks)
-
-    def _open(self) -> NDArray[np.bool_]:
-        still = np.ones(self.layout.n_blocks, bool)
-        still[list(self.blocks)] = False
-        return still
-
-    def ready(self, at_last: bool) -> NDArray[np.int64]:
-        """Blocks with enough information to be decoded."""
-        ready = np.flatnonzero((self.known >= self._thresholds(at_last)) & self._open())
-        left = self.layout.n_blocks - len(self.blocks)
-        if (
-            at_last
-            or self.frames_waited >= _PATIENT_FRAMES
-            or ready.size >= min(_BLOCKS_AT_ONCE, _SHARE_AT_ONCE * left)
-        ):
-            return ready
-        return ready[:0]
-
-    def _thresholds(self, at_last: bool) -> NDArray[np.float64]:
-        if at_last:
-            return self.threshold - 2 * _RETRY_GAIN * self.layout.code.k
-        required = self.min_information
-        if self.layout.n_blocks >= _LEARN_FROM and len(self.read_at) >= _PROBES:
-            required = max(required, float(np.median(self.read_at[-4 * _BLOCKS_AT_ONCE :])) - _RETRY_GAIN)
-        return np.maximum(self.threshold, required * self.layout.code.k)
-
-    def read(self, which: NDArray[np.int64]) -> None:
-        """Decode blocks; if the first ones fail, the rest waits."""
-        self.frames_waited = 0
-        if self.layout.n_blocks >= _LEARN_FROM and not self.read_at:
-            ordered = which[np.argsort(-self.known[which])]
-            self._read_batch(ordered[:_PROBES])
-            which = np.sort(ordered[_PROBES:])
-            if not self.read_at:
-                return
-        for start in range(0, which.size, _BLOCKS_AT_ONCE):
-            self._read_batch(which[start : start + _BLOCKS_AT_ONCE])
-
-    def _read_batch(self, which: NDArray[np.int64]) -> None:
-        layout, object_id = self.layout, self.layout.object_id
-        llr = self.total[which]
-
-        masks = [
-            np.frombuffer(whiten(bytes(layout.block_bytes + CRC_BYTES), object_id, int(b)), np.uint8) for b in which
-        ]
-        mask, prefixes = np.stack(masks), [block_prefix(object_id, int(number)) for number in which]
-
-        def accepted(places: NDArray[np.int64], bits: NDArray[np.uint8]) -> NDArray[np.bool_]:
-            good = np.zeros(places.size, bool)
-            for i, plain in enumerate(np.packbits(bits, axis=1) ^ mask[places]):
-                coded = plain.tobytes()
-                if has_crc(coded, prefixes[places[i]]) and _is_likely(layout, bits[i], llr[places[i]]):
-                    self.blocks[int(which[places[i]])], good[i] = coded[:-CRC_BYTES], True
-            return good
-
-        read = ldpc.decode(layout.code, llr, accepted, _ITERATIONS)
-        self.read_at += (self.known[which[read]] / layout.code.k).tolist()
-        if read.mean() < _FEW:
-            self.min_information = float(self.known[which].mean()) / layout.code.k + _RETRY_GAIN
-        failed = which[~read]
-        self.threshold[failed] = self.known[failed] + _RETRY_GAIN * layout.code.k
+        read = {number: data for number, data in zip(numbers, found, strict=True) if data is not None}
+        self.blocks |= read
+        self.threshold[which] = self.known[which] + more
+        self.threshold[list(read)] = np.inf
+        if len(read) < _FEW * which.size:
+            self.min_information = float(self.known[which].mean()) + more
 
     def unpacked(self) -> Container | None:
         """The file, if all blocks are decoded and the hash fits; otherwise sets `failure`."""
@@ -258,34 +204,26 @@ class FilesUnderWay:
         return [f"{files} dropped: together they would take more than {self._max_bytes >> 20} MB (--file-memory)"]
 
 
-def _is_likely(layout: FileLayout, information_bits: NDArray[np.uint8], llr: NDArray[np.int8]) -> bool:
-    """Whether a decoded block agrees with the soft bits of its information part, which every fragment contains."""
-    sent = information_bits[layout.code.first_sent :]
-    received = llr[: sent.size] * ldpc.LLR_STEP
-    return bool(log_likelihood(sent, received) > _MIN_LIKELIHOOD * softbits.LN2 * information(received).sum())
-
-
 @dataclass(slots=True, eq=False)
 class _Timeline:
     """Mapping from burst numbers of an epoch to those of an object, and from the picture's columns to the screen's."""
 
-    epoch: int
     offset: int
     placement: Placement
     file: FileState
-    #: The first and the last burst with a matching announcement.
+    #: The first burst that is certainly of the file, and the last one with a matching announcement.
     since: int
     until: int
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
     """A burst that may be an announcement, under a placement of its columns."""
 
     epoch: int
     number: int
     placement: Placement
-    buffer: Float32 = field(default_factory=lambda: np.zeros(0, np.float32))
+    buffer: Float32
 
 
 class FileSearch:
@@ -302,74 +240,61 @@ class FileSearch:
         self._columns, self._payload_symbols = columns, payload_symbols
         self._layout = announcement_layout(columns, payload_symbols)
         self.files: dict[tuple[int, int, int, int], FileState] = {}
-        #: Timelines of every epoch, latest last.
-        self._timelines: dict[int, list[_Timeline]] = {}
-        self._waiting: list[_Burst] = []
-        #: Recent bursts with the timeline by which they were added.
-        self._recent: list[tuple[_Timeline, _Burst]] = []
+        #: Latest timeline of every epoch.
+        self._timelines: dict[int, _Timeline] = {}
+        #: Bursts that no announcement has settled yet: what follows the last one of a file may be of the next file.
+        self._open: list[_Burst] = []
         self._candidates: list[_Candidate] = []
         self._n_shifted = 0
-        #: Bursts of the current frame.
-        self._fresh: list[tuple[_Timeline, _Burst]] = []
         #: Sentences about refused files.
         self.notes: list[str] = []
 
     def placement(self, epoch: int) -> Placement | None:
         """Placement of the columns by the announcements of this epoch; None if there were none."""
-        return self._timelines[epoch][-1].placement if epoch in self._timelines else None
+        return self._timelines[epoch].placement if epoch in self._timelines else None
 
-    def add(
-        self, soft: FrameSoftBits, settled: Placement | None, at_last: bool = False
-    ) -> list[tuple[FileState, Container]]:
+    def add(self, soft: FrameSoftBits, settled: Placement | None) -> list[tuple[FileState, Container]]:
         """Add bursts and return the files that they complete; `settled` is the placement of their columns if known."""
         settled = settled or self.placement(soft.epoch)
         for number, llr in zip(soft.burst, soft.llr, strict=True):
             groups = [[settled]] if settled else possible_placements(llr)[: 2 + (self._n_shifted < _MAX_SHIFTED)]
             self._n_shifted += len(groups) > 2
-            for placement in (placement for group in groups for placement in group):
-                self._look_for_announcement(_Candidate(soft.epoch, int(number), placement), placement.of(llr))
+            for placement in chain(*groups):
+                self._look_for_announcement(soft.epoch, int(number), placement, placement.of(llr))
         # These have too few copies to decide. A batch costs little more than a single attempt.
         if len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
             self._try_gathered()
-        quantised = ldpc.quantised(soft.llr)
-        for number, llr in zip(soft.burst, quantised, strict=True):
-            self._enter(_Burst(soft.epoch, int(number), llr), soft.time_s)
-        self._flush_entered()
-        return self._complete(at_last)
+        bursts = [
+            _Burst(soft.epoch, *burst) for burst in zip(soft.burst.tolist(), ldpc.quantised(soft.llr), strict=True)
+        ]
+        self._open += bursts
+        del self._open[: -max(1, _MAX_OPEN // max(bursts[0].llr.size, 1))]
+        line = self._timelines.get(soft.epoch)
+        if line is not None:
+            file = line.file
+            file.first_time_s = soft.time_s if file.first_time_s is None else file.first_time_s
+            file.last_time_s = soft.time_s
+            file.frames_waited += 1
+            _enter_bursts(line, [burst for burst in bursts if burst.number >= line.since], 1)
+        return self._complete(at_last=False)
 
     def finish(self) -> list[tuple[FileState, Container]]:
         """Decode the remaining announcements and blocks."""
         self._try_gathered()
-        self._flush_entered()
         return self._complete(at_last=True)
 
     # -- announcements -------------------------------------------------------------------------------------------------
 
-    def _look_for_announcement(self, candidate: _Candidate, llr: Float32) -> None:
-        candidate.buffer = gathered(self._layout, llr)
-        similarity = same_bits_llr(candidate.buffer, float(surprise(llr).sum(dtype=np.float64)))
-        if similarity < MIN_SIMILARITY:
+    def _look_for_announcement(self, epoch: int, number: int, placement: Placement, llr: Float32) -> None:
+        buffer = gathered(self._layout, llr)
+        similarity = same_bits_llr(buffer, float(surprise(llr).sum(dtype=np.float64)))
+        if similarity < MIN_SIMILARITY or information(buffer).sum() < TRY_FROM * self._layout.code.k:
             return
-        if information(candidate.buffer).sum() < TRY_FROM * self._layout.code.k:
-            return
+        candidate = _Candidate(epoch, number, placement, buffer)
         if similarity > -MIN_SIMILARITY:
-            if not self._is_expected(candidate):
-                self._try_candidates([candidate])
-        elif candidate.epoch not in self._timelines:
+            self._try_candidates([candidate])
+        elif epoch not in self._timelines:
             self._candidates.append(candidate)
-
-    def _is_expected(self, candidate: _Candidate) -> bool:
-        """Whether a burst is the announcement that its timeline predicts."""
-        line = _line_of(self._timelines.get(candidate.epoch, []), candidate.number)
-        burst = 0 if line is None else candidate.number + line.offset
-        if line is None or burst % ANNOUNCEMENT_PERIOD or burst >= 1 << 32:
-            return False
-        coded = replace(line.file.announcement, burst=burst).protected()
-        bits = np.unpackbits(np.frombuffer(coded, np.uint8))
-        if line.file.dropped or not is_likely(self._layout, bits, candidate.buffer):
-            return False
-        line.until = max(line.until, candidate.number)
-        return True
 
     def _try_gathered(self) -> None:
         candidates, self._candidates = self._candidates, []
@@ -378,9 +303,8 @@ class FileSearch:
 
     def _try_candidates(self, candidates: list[_Candidate]) -> None:
         buffers = np.stack([candidate.buffer for candidate in candidates])
-        words = read_words(self._layout, buffers, unprotect_announcement)
-        for candidate, word in zip(candidates, words, strict=True):
-            announcement = None if word is None else unprotect_announcement(word)
+        found = read_words(self._layout.code, buffers, lambda _, word: unprotect_announcement(word))
+        for candidate, announcement in zip(candidates, found, strict=True):
             if announcement is not None:
                 self._announced(announcement, candidate)
 
@@ -391,11 +315,18 @@ class FileSearch:
             if known is None:
                 return
         offset, number, placement = announcement.burst - candidate.number, candidate.number, candidate.placement
-        lines = self._timelines.setdefault(candidate.epoch, [])
-        if not lines or (lines[-1].offset, lines[-1].file, lines[-1].placement) != (offset, known, placement):
-            lines.append(_Timeline(candidate.epoch, offset, placement, known, number, number))
-            self._claim(lines)
-            del lines[:-_MAX_TIMELINES]
+        line = self._timelines.get(candidate.epoch)
+        if line is None or (line.offset, line.file, line.placement) != (offset, known, placement):
+            # A change of files is certain where a file begins; later only its announcements are.
+            begins = line is None or -offset > line.until
+            before, line = line, _Timeline(offset, placement, known, -offset if begins else number, number)
+            self._timelines[candidate.epoch] = line
+            doubtful = [b for b in self._open if b.epoch == candidate.epoch and b.number >= -offset]
+            if before is not None:
+                _enter_bursts(before, [b for b in doubtful if b.number >= before.since], -1)
+            _enter_bursts(line, [b for b in doubtful if b.number >= line.since], 1)
+        line.until = max(line.until, number)
+        self._open = [b for b in self._open if b.epoch != candidate.epoch or b.number > number]
 
     def _begun(self, announcement: Announcement) -> FileState | None:
         """Start a new file; None if it is too long."""
@@ -405,7 +336,7 @@ class FileSearch:
                 "it was not received"
             )
             return None
-        file = FileState.begin(announcement, self._columns, self._payload_symbols)
+        file = FileState(announcement, self._columns, self._payload_symbols)
         if not self._under_way.admit(file):
             self._add_note(
                 f"a file of {announcement.length} bytes was announced, which takes {file.n_bytes >> 20} MB to receive; "
@@ -420,58 +351,13 @@ class FileSearch:
         if sentence not in self.notes and len(self.notes) < _MAX_NOTES:
             self.notes.append(sentence)
 
-    def _claim(self, lines: list[_Timeline]) -> None:
-        """Assign waiting bursts, and some of other files, to the newest timeline."""
-        line = lines[-1]
-        waiting, self._waiting = self._waiting, []
-        mine: list[_Burst] = []
-        for burst in waiting:
-            (mine if burst.epoch == line.epoch and _line_of(lines, burst.number) is line else self._waiting).append(
-                burst
-            )
-        recent, self._recent = self._recent, []
-        for before, burst in recent:
-            if burst.epoch != line.epoch or _line_of(lines, burst.number) is before:
-                self._recent.append((before, burst))
-                continue
-            _enter_bursts(before, [burst], -1)
-            if _line_of(lines, burst.number) is line:
-                mine.append(burst)
-                self._recent.append((line, burst))
-        _enter_bursts(line, mine, 1)
-
-    # -- data ----------------------------------------------------------------------------------------------------------
-
-    def _enter(self, burst: _Burst, time_s: float) -> None:
-        line = _line_of(self._timelines.get(burst.epoch, []), burst.number)
-        if line is None:
-            self._waiting.append(burst)
-            capacity = max(1, _MAX_WAITING // max(burst.llr.size, 1))
-            del self._waiting[:-capacity]
-            return
-        file = line.file
-        file.first_time_s = time_s if file.first_time_s is None else file.first_time_s
-        file.last_time_s = time_s
-        self._fresh.append((line, burst))
-
-    def _flush_entered(self) -> None:
-        """Add all bursts of a frame together."""
-        fresh, self._fresh = self._fresh, []
-        for line in dict.fromkeys(line for line, _ in fresh):
-            _enter_bursts(line, [burst for owner, burst in fresh if owner is line], 1)
-            line.file.frames_waited += 1
-        self._recent += fresh
-        del self._recent[:-_MAX_RECENT]
-
     def _complete(self, at_last: bool) -> list[tuple[FileState, Container]]:
         """Read the blocks that are ready, and return the files that are whole by now."""
         found = []
         for file in self.files.values():
             if not file.under_way:
                 continue
-            which = file.ready(at_last)
-            if which.size:
-                file.read(which)
+            file.read_ready(at_last)
             container = file.unpacked()
             if container is not None:
                 found.append((file, container))
@@ -480,18 +366,6 @@ class FileSearch:
                     f"a file of {file.layout.length} bytes is complete but not what was sent: {file.failure}"
                 )
         return found
-
-
-def _line_of(lines: list[_Timeline], number: int) -> _Timeline | None:
-    """The latest timeline that a burst fits; None if there is none or two fit."""
-    for place in reversed(range(len(lines))):
-        line, earlier = lines[place], lines[place - 1] if place else None
-        if number + line.offset < 0 or (earlier is not None and number <= earlier.until):
-            continue
-        # A change of files is certain where a file begins; later only its announcements are.
-        begins = earlier is None or -line.offset > earlier.until
-        return line if begins or number >= line.since else None
-    return None
 
 
 def _enter_bursts(line: _Timeline, bursts: list[_Burst], sign: int) -> None:

@@ -30,21 +30,25 @@ def protect(data: bytes, object_id: int, block: int, crc_prefix: bytes = b"") ->
     return whiten(data + crc.to_bytes(CRC_BYTES, "big"), object_id, block)
 
 
-def unprotect(coded: bytes, object_id: int, block: int) -> bytes | None:
+def unprotect(coded: bytes, object_id: int, block: int, crc_prefix: bytes = b"") -> bytes | None:
     """Undo `protect`; None if the CRC does not fit."""
     plain = whiten(coded, object_id, block)
-    return plain[:-CRC_BYTES] if has_crc(plain) else None
+    data, crc = plain[:-CRC_BYTES], int.from_bytes(plain[-CRC_BYTES:], "big")
+    return data if zlib.crc32(data, zlib.crc32(crc_prefix)) == crc else None
 
 
-def has_crc(plain: bytes, crc_prefix: bytes = b"") -> bool:
-    """Whether an unwhitened block ends with its CRC."""
-    crc = zlib.crc32(plain[:-CRC_BYTES], zlib.crc32(crc_prefix))
-    return crc == int.from_bytes(plain[-CRC_BYTES:], "big")
-
-
-def block_prefix(object_id: int, block: int) -> bytes:
-    """Prefix that the CRC of a file's block covers before its data."""
+def _block_prefix(object_id: int, block: int) -> bytes:
     return object_id.to_bytes(2, "big") + block.to_bytes(4, "big")
+
+
+def protect_block(data: bytes, object_id: int, block: int) -> bytes:
+    """Information bits of a file's block, whose CRC covers its object and number, too."""
+    return protect(data, object_id, block, _block_prefix(object_id, block))
+
+
+def unprotect_block(coded: bytes, object_id: int, block: int) -> bytes | None:
+    """Data of a file's block, or None if its CRC does not fit."""
+    return unprotect(coded, object_id, block, _block_prefix(object_id, block))
 
 
 # -- beacons -----------------------------------------------------------------------------------------------------------

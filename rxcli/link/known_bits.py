@@ -70,7 +70,7 @@ def known_bits(layout: BeaconLayout, buffers: Float32) -> KnownBits:
     known[..., 0] = np.maximum(known[..., 0], limit * is_ascii * is_letter)
     known[:, 0, : 8 - len(KINDS).bit_length()] = 1.0
     llr = np.log1p(known) - np.log(np.maximum(1 - known, np.exp(-MAX_LLR)))
-    llr = (llr.reshape(len(buffers), -1) * sign).astype(np.float32)
+    llr = (llr.reshape(len(buffers), 8 * length) * sign).astype(np.float32)
     sent = np.pad(llr[:, first_sent:], ((0, 0), (0, layout.n_bits + first_sent - 8 * length)))
     of_zeros = top[:, 0] + np.log(total[:, 0] / zeros.shape[1])
     return KnownBits(llr[:, :first_sent], sent, known.sum(axis=(1, 2)), of_zeros)

@@ -3,13 +3,12 @@
 A *label* is the 7 bits of payload symbol (burst b, symbol s, column c); a column of weight w sends the first k(w).
 """
 
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.link.ldpc import Code, nr_code
+from rxcli.link.ldpc import nr_code
 from rxcli.link.sequences import largest_coprime, splitmix64, stride
 
 LABEL_BITS = 7
@@ -31,52 +30,33 @@ READY = (1.075, 1.10, 1.14)
 Places = NDArray[np.int64]
 
 
-def _rotation(passes: Places) -> Places:
-    """(..., 7) order in which the seven bits of a label are sent in a pass."""
-    return np.asarray((np.arange(LABEL_BITS) + 3 * passes[..., None]) % LABEL_BITS)
+def _bits_of(label: Places, passes: Places) -> Places:
+    """(..., 7) buffer positions of the bits of labels, in the order in which they are sent in their passes."""
+    rotated = (np.arange(LABEL_BITS) + 3 * passes[..., None]) % LABEL_BITS
+    return np.asarray(LABEL_BITS * label[..., None] + rotated)
 
 
-@dataclass(frozen=True)
 class BeaconLayout:
-    """Beacons of body length `length`, and announcements, on a screen of C columns and N payload symbols."""
+    """Beacons of body length `length` on a screen of C columns and N payload symbols.
 
-    length: int
-    columns: int
-    payload_symbols: int
-    #: Of an announcement, whose every burst stands alone.
-    single: bool = False
+    Args:
+        length: of the body, bytes.
+        columns: C.
+        payload_symbols: N.
+        single: whether every burst stands alone, as an announcement does.
+    """
 
-    @cached_property
-    def code(self) -> Code:
-        """LDPC code."""
-        return nr_code(2, 8 * (self.length + CRC_BYTES))
-
-    @cached_property
-    def period(self) -> int:
-        """P: bursts of a round."""
-        if self.single:
-            return 1
-        return max(1, -(-5 * self.code.k // (4 * LABEL_BITS * self.payload_symbols * self.columns)))
-
-    @cached_property
-    def n_labels(self) -> int:
-        """Y: different labels."""
-        units = self.period * self.payload_symbols * self.columns
-        return largest_coprime(min(self.code.buffer_bits // LABEL_BITS, units), self.columns)
-
-    @cached_property
-    def n_bits(self) -> int:
-        """Bits of the buffer that are sent."""
-        return LABEL_BITS * self.n_labels
-
-    @cached_property
-    def places(self) -> Places:
-        """(P, N, C, 7) buffer position of every bit of a round's labels."""
-        unit = np.arange(self.period * self.payload_symbols * self.columns).reshape(
-            self.period, self.payload_symbols, self.columns
-        )
-        label = unit * stride(self.n_labels) % self.n_labels
-        return LABEL_BITS * label[..., None] + _rotation(unit // self.n_labels)
+    def __init__(self, length: int, columns: int, payload_symbols: int, single: bool = False) -> None:
+        self.length, self.code = length, nr_code(2, 8 * (length + CRC_BYTES))
+        n_units = payload_symbols * columns
+        #: P: bursts of a round.
+        self.period = 1 if single else max(1, -(-5 * self.code.k // (4 * LABEL_BITS * n_units)))
+        unit = np.arange(self.period * n_units).reshape(self.period, payload_symbols, columns)
+        n_labels = largest_coprime(min(self.code.buffer_bits // LABEL_BITS, unit.size), columns)
+        #: Bits of the buffer that are sent.
+        self.n_bits = LABEL_BITS * n_labels
+        #: (P, N, C, 7) buffer position of every bit of a round's labels.
+        self.places = _bits_of(unit * stride(n_labels) % n_labels, unit // n_labels)
 
 
 @lru_cache(maxsize=64)
@@ -90,78 +70,32 @@ def announcement_layout(columns: int, payload_symbols: int) -> BeaconLayout:
     return beacon_layout(ANNOUNCEMENT_LENGTH, columns, payload_symbols, True)
 
 
-@dataclass(frozen=True)
 class FileLayout:
     """Layout of a container of `length` bytes, object `object_id`, on a screen of C columns and N payload symbols."""
 
-    object_id: int
-    length: int
-    mother: int
-    columns: int
-    payload_symbols: int
-
-    @cached_property
-    def n_blocks(self) -> int:
-        """B: blocks."""
-        return -(-self.length // BLOCK_BYTES)
-
-    @cached_property
-    def block_bytes(self) -> int:
-        """Bytes of a block without its CRC."""
-        return min(self.length, BLOCK_BYTES)
-
-    @cached_property
-    def code(self) -> Code:
-        """The code of every block."""
-        return nr_code(1, 8 * (self.block_bytes + CRC_BYTES))
-
-    @cached_property
-    def n_labels(self) -> int:
-        """Y: labels of a block."""
-        return _EXPANSION_HALVES[self.mother] * self.code.k // (2 * LABEL_BITS)
-
-    @cached_property
-    def n_bits(self) -> int:
-        """M: bits of a block's buffer that are sent."""
-        return LABEL_BITS * self.n_labels
-
-    @cached_property
-    def _window(self) -> int:
-        """W: largest shift of passes, labels."""
-        return min(self.n_labels, -(-4 * self.payload_symbols * self.columns // self.n_blocks))
-
-    @property
-    def ready(self) -> float:
-        """Bits of information at which a block is decoded."""
-        return READY[self.mother] * self.code.k
-
-    def _first_unit(self, bursts: Places) -> Places:
-        data = bursts - bursts // ANNOUNCEMENT_PERIOD - 1
-        return np.asarray(data * (self.payload_symbols * self.columns))
-
-    def all_differ(self, bursts: Places) -> bool:
-        """Whether data bursts `bursts` lie within one pass, so that no bit is sent twice."""
-        unit, per_pass = self._first_unit(bursts), self.n_blocks * self.n_labels
-        return bool(unit.min() // per_pass == (unit.max() + self.payload_symbols * self.columns - 1) // per_pass)
-
-    def labels(self, bursts: Places) -> tuple[Places, Places, Places]:
-        """Block, label and pass (n, N, C) of every symbol of data bursts `bursts` (n,)."""
-        shape = (self.payload_symbols, self.columns)
-        unit = self._first_unit(bursts)[:, None, None] + np.arange(shape[0] * shape[1]).reshape(shape)
-        cycle, turn = np.divmod(unit, self.n_blocks)
-        number, label = np.divmod(cycle, self.n_labels)
-        shift = (splitmix64(number.astype(np.uint64)) % np.uint64(self._window)).astype(np.int64)
-        return self._blocks(cycle, turn), (label + shift) * stride(self.n_labels) % self.n_labels, number
-
-    @staticmethod
-    def bits_of(label: Places, number: Places) -> Places:
-        """(..., 7) buffer positions of the bits of labels in their passes."""
-        return LABEL_BITS * label[..., None] + _rotation(number)
+    def __init__(self, object_id: int, length: int, mother: int, columns: int, payload_symbols: int) -> None:
+        self.object_id, self.length, self._shape = object_id, length, (payload_symbols, columns)
+        #: B: blocks, and bytes of each without its CRC.
+        self.n_blocks, self.block_bytes = -(-length // BLOCK_BYTES), min(length, BLOCK_BYTES)
+        #: The code of every block.
+        self.code = nr_code(1, 8 * (self.block_bytes + CRC_BYTES))
+        #: Y: labels of a block; M: bits of its buffer that are sent.
+        self.n_labels = _EXPANSION_HALVES[mother] * self.code.k // (2 * LABEL_BITS)
+        self.n_bits = LABEL_BITS * self.n_labels
+        #: Bits of information at which a block is decoded.
+        self.ready = READY[mother] * self.code.k
+        # W: largest shift of passes, labels.
+        self._window = min(self.n_labels, -(-4 * payload_symbols * columns // self.n_blocks))
 
     def places(self, bursts: Places) -> tuple[Places, Places]:
         """Blocks (n, N, C) and buffer positions (n, N, C, 7) of data bursts `bursts` (n,)."""
-        blocks, label, number = self.labels(bursts)
-        return blocks, self.bits_of(label, number)
+        n_units = self._shape[0] * self._shape[1]
+        data = bursts - bursts // ANNOUNCEMENT_PERIOD - 1
+        unit = data[:, None, None] * n_units + np.arange(n_units).reshape(self._shape)
+        cycle, turn = np.divmod(unit, self.n_blocks)
+        number, label = np.divmod(cycle, self.n_labels)
+        shift = (splitmix64(number.astype(np.uint64)) % np.uint64(self._window)).astype(np.int64)
+        return self._blocks(cycle, turn), _bits_of((label + shift) * stride(self.n_labels) % self.n_labels, number)
 
     def _blocks(self, cycle: Places, turn: Places) -> Places:
         if self.n_blocks == 1:

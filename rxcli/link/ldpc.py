@@ -5,7 +5,6 @@ first 2 z bits are never sent and filler bits are known zeros; all others, in or
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -30,75 +29,52 @@ Bits = NDArray[np.uint8]
 Edge = tuple[int, int]
 
 
-@dataclass(frozen=True, slots=True)
 class Code:
-    """A code; rows are lists of (block column, shift)."""
+    """A code for `k` information bits.
 
-    graph: int
-    k: int
-    z: int
-    rows: tuple[tuple[Edge, ...], ...]
+    Args:
+        graph: base graph, 1 or 2.
+        k: information bits.
 
-    @property
-    def information_columns(self) -> int:
-        """Block columns of information and filler bits."""
-        return _INFORMATION_COLUMNS[self.graph]
+    Raises:
+        ValueError: `k` is too large for the lifting sizes.
+    """
 
-    @property
-    def filler(self) -> int:
-        """Number of known zeros after the information bits."""
-        return self.information_columns * self.z - self.k
-
-    @property
-    def first_sent(self) -> int:
-        """First information bit that is sent; the buffer begins with it."""
-        return _PUNCTURED * self.z
-
-    @property
-    def n_columns(self) -> int:
-        """Block columns."""
-        return self.information_columns + len(self.rows)
-
-    @property
-    def buffer_bits(self) -> int:
-        """Bits that may be sent."""
-        return (self.n_columns - _PUNCTURED) * self.z - self.filler
+    def __init__(self, graph: int, k: int) -> None:
+        kb = _INFORMATION_COLUMNS[graph]
+        if not 0 < k <= kb * _MAX_LIFTING:
+            raise ValueError(f"k must be in 1..{kb * _MAX_LIFTING} for graph {graph} (got {k})")
+        sizes = (
+            (a << i, number) for number, a in enumerate(_LIFTING_BASES) for i in range(8) if a << i <= _MAX_LIFTING
+        )
+        self.k = k
+        self.z, lifting_set = min((z, number) for z, number in sizes if kb * z >= k)
+        #: Block columns of information and filler bits, and known zeros after the information bits.
+        self.information_columns, self.filler = kb, kb * self.z - k
+        #: First information bit that is sent; the buffer begins with it.
+        self.first_sent = _PUNCTURED * self.z
+        table = _base_graph(graph)
+        #: Each row of checks: block column and shift of its edges.
+        self.rows: list[list[Edge]] = [[] for _ in range(int(table[:, 0].max()) + 1)]
+        for row, column, *shifts in table.tolist():
+            self.rows[row].append((column, shifts[lifting_set] % self.z))
+        self.n_columns = kb + len(self.rows)
+        #: Bits that may be sent.
+        self.buffer_bits = (self.n_columns - _PUNCTURED) * self.z - self.filler
 
     def rows_for(self, buffer_bits: int) -> int:
         """Rows that involve the first `buffer_bits` bits of the buffer."""
-        last = _PUNCTURED * self.z + buffer_bits + self.filler
+        last = self.first_sent + buffer_bits + self.filler
         return min(len(self.rows), max(_CORE_ROWS, -(-last // self.z) - self.information_columns))
+
+
+nr_code = cache(Code)
 
 
 @cache
 def _base_graph(graph: int) -> NDArray[np.int64]:
-    text = Path(__file__).with_name(f"nr_base_graph_{graph}.csv").read_text(encoding="ascii")
-    return np.array([[int(v) for v in line.split(",")] for line in text.split()[1:]], np.int64)
-
-
-def _lifting(k: int, graph: int) -> tuple[int, int]:
-    """The smallest lifting size that holds `k` bits, and its set."""
-    sizes = ((a << i, number) for number, a in enumerate(_LIFTING_BASES) for i in range(8) if a << i <= _MAX_LIFTING)
-    return min((z, number) for z, number in sizes if _INFORMATION_COLUMNS[graph] * z >= k)
-
-
-@cache
-def nr_code(graph: int, k: int) -> Code:
-    """Build the code of base graph 1 or 2 for `k` information bits.
-
-    Raises:
-        ValueError: `k` is too large for the lifting sizes, or smaller than the number of punctured bits.
-    """
-    if not 0 < k <= _INFORMATION_COLUMNS[graph] * _MAX_LIFTING:
-        raise ValueError(f"k must be in 1..{_INFORMATION_COLUMNS[graph] * _MAX_LIFTING} for graph {graph} (got {k})")
-    z, lifting_set = _lifting(k, graph)
-    if k < _PUNCTURED * z:
-        raise ValueError(f"k must be at least {_PUNCTURED * z} (got {k})")
-    table = _base_graph(graph)
-    rows: list[list[Edge]] = [[] for _ in range(int(table[:, 0].max()) + 1)]
-    for row, column, *shifts in table.tolist():
-        rows[row].append((column, shifts[lifting_set] % z))
-    return Code(graph, k, z, tuple(tuple(row) for row in rows))
+    path = Path(__file__).with_name(f"nr_base_graph_{graph}.csv")
+    return np.loadtxt(path, np.int64, delimiter=",", skiprows=1)
 
 
 def encode(code: Code, information: Bits) -> Bits:
@@ -111,45 +87,28 @@ def encode(code: Code, information: Bits) -> Bits:
     Returns:
         (batch, code.buffer_bits) uint8.
     """
-    batch = information.shape[0]
+    batch, kb, core = information.shape[0], code.information_columns, code.rows[:_CORE_ROWS]
     coded = np.zeros((batch, code.n_columns, code.z), np.uint8)
-    kb = code.information_columns
     coded[:, :kb] = np.pad(information, ((0, 0), (0, code.filler))).reshape(batch, kb, code.z)
-    _solve_core(code, coded)
-    for number, row in enumerate(code.rows[_CORE_ROWS:], _CORE_ROWS):
-        coded[:, kb + number] = _sum(coded, [edge for edge in row if edge[0] != kb + number])
+    # The sum of the four core rows contains only one shift of the first parity column and no other parity.
+    shifts = [shift for row in core for column, shift in row if column == kb]
+    (left,) = {shift for shift in shifts if shifts.count(shift) % 2}
+    coded[:, kb] = np.roll(_sum(coded, [edge for row in core for edge in row if edge[0] < kb]), left, axis=1)
+    # Each further row gives the next parity column, without shift.
+    for column, row in enumerate(code.rows[: _CORE_ROWS - 1] + code.rows[_CORE_ROWS:], kb + 1):
+        coded[:, column] = _sum(coded, [edge for edge in row if edge[0] != column])
     flat = coded.reshape(batch, -1)
-    return np.concatenate([flat[:, _PUNCTURED * code.z : code.k], flat[:, kb * code.z :]], axis=1)
+    return np.concatenate([flat[:, code.first_sent : code.k], flat[:, kb * code.z :]], axis=1)
 
 
 def _sum(coded: Bits, edges: list[Edge]) -> Bits:
     """(batch, z) sum over some edges of a row, modulo 2."""
-    total = np.zeros((coded.shape[0], coded.shape[2]), np.uint8)
-    for column, shift in edges:
-        total ^= np.roll(coded[:, column], -shift, axis=1)
-    return total
+    rolled = [np.roll(coded[:, column], -shift, axis=1) for column, shift in edges]
+    return np.asarray(np.bitwise_xor.reduce(rolled))
 
 
-def _solve_core(code: Code, coded: Bits) -> None:
-    """Solve for the four core parity columns: the sum of the four rows contains only a shift of the first column."""
-    kb = code.information_columns
-    core = code.rows[:_CORE_ROWS]
-    shifts = [shift for row in core for column, shift in row if column == kb]
-    (left,) = {shift for shift in shifts if shifts.count(shift) % 2}
-    known = [edge for row in core for edge in row if edge[0] < kb]
-    coded[:, kb] = np.roll(_sum(coded, known), left, axis=1)
-    solved = set(range(kb + 1))
-    while len(solved) < kb + _CORE_ROWS:
-        for row in core:
-            missing = [edge for edge in row if edge[0] not in solved]
-            if len(missing) == 1:
-                (column, shift), *_ = missing
-                coded[:, column] = np.roll(_sum(coded, [e for e in row if e[0] in solved]), shift, axis=1)
-                solved.add(column)
-
-
-#: Acceptance test of hard decisions: (batch indices (n,), information bits (n, k)) -> (n,) bool.
-Accept = Callable[[NDArray[np.int64], Bits], NDArray[np.bool_]]
+#: Acceptance test of hard decisions: place in the batch, information bits (k,) -> whether they are right.
+Accept = Callable[[int, Bits], bool]
 
 
 def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
@@ -158,17 +117,15 @@ def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
 
 
 #: Iterations after which a block is given up as no codeword, and the least ratio of its share of unsatisfied checks to
-#: that after the first iteration at which it is; both again for a block with this share of nearly certain bits.
+#: that after the first iteration at which it is.
 _PATIENCE, _MAX_RATIO = 6, 0.95
-_PATIENCE_CERTAIN, _MAX_RATIO_CERTAIN, _CERTAIN_BITS, _CERTAIN_LLR = 2, 0.4, 0.9, 3.0
 
 
 def decode(
     code: Code,
     buffer_llr: NDArray[np.int8],
     accept: Accept,
-    max_iterations: int = 22,
-    gives_up: bool = False,
+    max_iterations: int = 25,
     unsent_llr: NDArray[np.int8] | None = None,
 ) -> NDArray[np.bool_]:
     """Decode a batch of blocks by layered normalised min-sum in 16-bit numbers, until `accept` accepts them.
@@ -178,60 +135,37 @@ def decode(
     Args:
         code: the code.
         buffer_llr: (batch, M) int8: ln p(1)/p(0) in steps of `LLR_STEP` of the first M bits of the buffer, 0 unknown.
-        accept: called after every iteration with batch indices and information bits.
-        max_iterations: maximum number of iterations.
-        gives_up: whether a block that looks like no codeword is given up before all iterations.
+        accept: called after every iteration but the first with the hard decisions of each block.
+        max_iterations: maximum number of iterations; a block that looks like no codeword is given up earlier.
         unsent_llr: (batch, first_sent) likewise of the bits that are never sent, if anything is known of them.
 
     Returns:
         (batch,) which blocks were accepted.
     """
-    n_rows = code.rows_for(buffer_llr.shape[1])
-    total = _decoder_input(code, buffer_llr, n_rows)
+    batch, n_bits = buffer_llr.shape
+    n_rows, z = code.rows_for(n_bits), code.z
+    # ln p(0)/p(1) by bit and block; filler bits are known to be zero.
+    total = np.zeros(((code.information_columns + n_rows) * z, batch), np.int16)
+    total[np.r_[code.first_sent : code.k, code.information_columns * z : len(total)][:n_bits]] = -buffer_llr.T
+    total[code.k : code.information_columns * z] = _KNOWN
     if unsent_llr is not None:
-        total[: code.first_sent] = -unsent_llr.T.astype(np.int16)
-    layers = _Layers(code, n_rows, total)
-    places = np.arange(buffer_llr.shape[0])
-    accepted = np.zeros(places.size, bool)
-    still = np.ones(places.size, bool)
-    is_certain = (np.abs(buffer_llr) > _CERTAIN_LLR / LLR_STEP).mean(axis=1) > _CERTAIN_BITS
-    first_share = np.ones(places.size)
-    for iteration in range(1, max_iterations + 1):
+        total[: code.first_sent] = -unsent_llr.T
+    layers, places, accepted = _Layers(code, n_rows, total), np.arange(batch), np.zeros(batch, bool)
+    layers.update()
+    first_share = layers.unsatisfied()
+    for iteration in range(2, max_iterations + 1):
         layers.update()
-        if iteration == 1 and gives_up:
-            first_share = layers.unsatisfied()
-        if iteration == 1 and max_iterations > 1:
-            continue
-        which = np.flatnonzero(still)
-        good = accept(places[which], layers.information(which))
-        accepted[places[which[good]]] = True
-        still[which[good]] = False
-        if gives_up and iteration in (_PATIENCE_CERTAIN, _PATIENCE):
-            max_ratio = np.where(is_certain, _MAX_RATIO_CERTAIN, _MAX_RATIO)
-            still &= (layers.unsatisfied() < max_ratio * first_share) | ((iteration < _PATIENCE) & ~is_certain)
+        good = [accept(*block) for block in zip(places.tolist(), layers.information(), strict=True)]
+        accepted[places[good]] = True
+        still = ~accepted[places]
+        if iteration == _PATIENCE:
+            still &= layers.unsatisfied() < _MAX_RATIO * first_share
         if not still.any():
             break
-        if still.mean() < _CROWDED:
+        if not still.all():
             layers.keep(still)
             places, first_share = places[still], first_share[still]
-            is_certain, still = is_certain[still], still[still]
     return accepted
-
-
-#: Finished blocks are removed when the share of unfinished ones falls below this, since removal costs time.
-_CROWDED = 0.7
-
-
-def _decoder_input(code: Code, buffer_llr: NDArray[np.int8], n_rows: int) -> NDArray[np.int16]:
-    """(block columns * z, batch) int16 ln p(0)/p(1), with filler bits known to be zero."""
-    batch, n_bits = buffer_llr.shape
-    kb, z = code.information_columns, code.z
-    flat = np.zeros(((kb + n_rows) * z, batch), np.int16)
-    systematic = min(n_bits, code.k - _PUNCTURED * z)
-    flat[_PUNCTURED * z : _PUNCTURED * z + systematic] = -buffer_llr[:, :systematic].T.astype(np.int16)
-    flat[code.k : kb * z] = _KNOWN
-    flat[kb * z : kb * z + n_bits - systematic] = -buffer_llr[:, systematic:].T.astype(np.int16)
-    return flat
 
 
 @cache
@@ -266,9 +200,9 @@ class _Layers:
         total = np.ascontiguousarray(self._total[:, blocks])
         self._begin(total, [np.ascontiguousarray(message[:, :, blocks]) for message in self._messages])
 
-    def information(self, blocks: NDArray[np.int64]) -> Bits:
-        """(n, k) hard decisions of some blocks of the batch."""
-        return np.asarray((self._total[: self._code.k] < 0).T[blocks], np.uint8)
+    def information(self) -> Bits:
+        """(batch, k) hard decisions."""
+        return np.asarray((self._total[: self._code.k] < 0).T, np.uint8)
 
     def unsatisfied(self) -> NDArray[np.float64]:
         """(batch,) share of checks that the hard decisions violate."""

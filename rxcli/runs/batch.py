@@ -86,13 +86,13 @@ def _with_subfolders(sources: list[Source]) -> list[Source]:
     """The sources with a place of its own for the taps of each, whatever others are called."""
     folders = [os.path.dirname(os.path.abspath(source.name)) for source in sources]
     try:
-        common = os.path.commonpath(folders) if folders else ""
-    except ValueError:  # several drives
+        common = os.path.commonpath(folders)
+    except ValueError:  # none, or several drives
         common = os.sep
     count: Counter[tuple[str, str]] = Counter()
     placed = []
     for source, folder in zip(sources, folders, strict=True):
-        below = os.path.relpath(folder, common) if folder != common else ""
+        below = os.path.relpath(folder, common)
         place = (below, plain_name(source.name).casefold())
         count[place] += 1
         own = below if count[place] == 1 else os.path.join(below, f"{count[place]}")

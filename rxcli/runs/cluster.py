@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-from rxcli.errors import InputError, OutputError, ReceiverError, UsageError
+from rxcli.errors import InputError, OutputError, ReceiverError, UsageError, reason_of
 from rxcli.outputs import PICTURE, TAPS, check_replaceable, make_parent, write_whole
 from rxcli.runs.batch import Decoded, Decoder, Source, in_order, unreadable
 from rxcli.types import FrameResult
@@ -79,7 +79,7 @@ def _connect(address: str, connect_s: float) -> Client:
         try:
             made.append(Client(address, timeout=connect_s, set_as_default=False))
         except Exception as error:  # Dask, its transports and TLS raise some ten unrelated types
-            failures.append(_first_line(error))
+            failures.append(reason_of(error))
         if not made:
             # A client that failed is closed here: its end and the start of another one wait for one lock of Dask, so
             # that a later connection would hang if garbage were collected within it.
@@ -97,11 +97,6 @@ def _connect(address: str, connect_s: float) -> Client:
     if not client.scheduler_info()["workers"]:
         log.warning("the scheduler at %s has no workers yet; waiting for some (`dask worker %s`)", address, address)
     return client
-
-
-def _first_line(error: BaseException) -> str:
-    text = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {text[0]:.120}" if text else type(error).__name__
 
 
 @contextmanager
@@ -179,5 +174,5 @@ def _await(source: Source, future: Any, address: str) -> _Outcome:
     except ReceiverError:
         raise
     except Exception as error:  # what a worker raises that cannot even load the task
-        reason = f"the workers of {address!r} cannot decode ({_first_line(error)})"
+        reason = f"the workers of {address!r} cannot decode ({reason_of(error)})"
         raise InputError(reason, "install the same vlc-rx there") from None

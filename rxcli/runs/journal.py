@@ -42,23 +42,13 @@ class Head:
     #: Option -> value, as JSON has it.
     options: dict[str, Any]
 
-    def differences(self, record: object) -> list[str]:
-        """Differences from the first line of an earlier run."""
-        if not isinstance(record, dict) or not isinstance(record.get("options"), dict):
-            return ["it does not state the options of its run"]
-        before, after = {"version": record.get("version")}, {"version": self.version}
-        for options, named in ((record["options"], before), (self.options, after)):
-            named |= {"--" + name.replace("_", "-"): value for name, value in options.items()}
-        return _differences(before, after)
-
 
 def _differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
+    def shown(values: Mapping[str, Any], name: str) -> str:
+        return shortened(json.dumps(values.get(name), default=str))
+
     changed = [name for name in {**before, **after} if before.get(name) != after.get(name)]
-    return [f"{name} was {_shown(before, name)}, is {_shown(after, name)}" for name in changed]
-
-
-def _shown(values: Mapping[str, Any], name: str) -> str:
-    return shortened(json.dumps(values.get(name), default=str))
+    return [f"{name} was {shown(before, name)}, is {shown(after, name)}" for name in changed]
 
 
 def file_facts(path: str) -> dict[str, Any] | None:
@@ -67,9 +57,8 @@ def file_facts(path: str) -> dict[str, Any] | None:
         info = os.stat(path)
     except (OSError, ValueError):
         return None
-    if not stat.S_ISREG(info.st_mode):
-        return None
-    return {"bytes": info.st_size, "modified_s": round(info.st_mtime_ns / 1e9, 6)}
+    facts = {"bytes": info.st_size, "modified_s": round(info.st_mtime_ns / 1e9, 6)}
+    return facts if stat.S_ISREG(info.st_mode) else None
 
 
 @dataclass(slots=True)
@@ -191,11 +180,10 @@ class Journal:
         lines: list[bytes] = []
         results: list[FrameResult] = []
         with replacing(self._path, follow=False) as hidden, hidden.open("wb") as out:
-            for number, (place, line, record) in enumerate(_records(self._path)):
+            for number, (line, record, result) in enumerate(_records(self._path)):
                 run = record.get("run", run)
                 if number == 0 and head is not None:
                     _check_same(self._path, head, run)
-                result = _result(record, place)
                 if results and result.source != results[0].source:
                     lines, results = [], []
                 if not results:
@@ -217,29 +205,36 @@ class Journal:
         self._open_files.close()
 
 
-def _records(path: Path) -> Iterator[tuple[str, bytes, dict[str, Any]]]:
-    """Place, line and record of every whole line of a journal."""
+def _records(path: Path) -> Iterator[tuple[bytes, dict[str, Any], FrameResult]]:
+    """Line, record and result of every whole line of a journal."""
     try:
         with path.open("rb") as file:
             for number, line in enumerate(file, start=1):
                 cut = line.rstrip(b"\0")[: len(_LINE_START)]  # a machine that stops leaves zeros behind it
                 if not line.endswith(b"\n") and _LINE_START.startswith(cut):
                     return
-                place = f"{path} line {number}"
                 try:
                     record = json.loads(line)
+                    result = from_record(record)
                 except (ValueError, RecursionError):
-                    raise UsageError(f"{place}: not JSON of ours", _ANOTHER) from None
-                if not isinstance(record, dict):
-                    raise UsageError(f"{place}: no result", _ANOTHER)
-                yield place, line, record
+                    raise UsageError(f"{path} line {number}: not JSON of ours", _ANOTHER) from None
+                except UsageError as error:
+                    raise UsageError(f"{path} line {number}: {error.message}", _ANOTHER) from None
+                yield line, record, result
     except OSError as error:
         raise InputError(f"{path}: cannot be resumed ({error.strerror})", "name another file") from None
 
 
 def _check_same(path: Path, head: Head, run: object) -> None:
     """Refuse to mix results of different options, before anything is changed."""
-    if problems := head.differences(run):
+    problems = ["it does not state the options of its run"]
+    if isinstance(run, dict) and isinstance(run.get("options"), dict):
+        before, after = (
+            {"version": of.get("version")} | {"--" + name.replace("_", "-"): v for name, v in of["options"].items()}
+            for of in (run, asdict(head))
+        )
+        problems = _differences(before, after)
+    if problems:
         more = f" (and {len(problems) - 3} other differences)" if len(problems) > 3 else ""
         raise UsageError(
             f"{path}: cannot be resumed, results would not go together: {'; '.join(problems[:3])}{more}",
@@ -258,10 +253,3 @@ def _has_changed(source: str, facts: object, paths: Mapping[str, str]) -> bool:
 
 def _open_no_link(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
-
-
-def _result(record: dict[str, Any], place: str) -> FrameResult:
-    try:
-        return from_record(record)
-    except UsageError as error:
-        raise UsageError(f"{place}: {error.message}", _ANOTHER) from None

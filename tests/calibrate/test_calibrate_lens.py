@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from rxcli.calibrate.lens import Board, Sighting, calibrate_lens, find_board, find_boards, uncovered_parts
+from rxcli.calibrate.lens import Board, LensCalibration, Sighting, calibrate_lens, find_board, find_boards
 from rxcli.cli.main import run
 from rxcli.errors import ReceiverError, UsageError
-from rxcli.profiles import CameraProfile, load_profile
+from rxcli.profiles import CameraProfile, LensModel, load_profile
 from rxcli.results.undistort import grey_levels
 from rxcli.types import Frame, Mosaic
 
@@ -136,8 +136,11 @@ def test_too_few_boards(boards: list[tuple[str, Any]]) -> None:
 def test_uncovered_parts_are_named() -> None:
     y, x = np.mgrid[2:480:20, 2:640:20]
     everywhere = np.column_stack([x.ravel(), y.ravel()]).astype(float)
-    assert uncovered_parts(everywhere, *SIZE) == ()
-    assert uncovered_parts(everywhere[(everywhere[:, 0] > 130) | (everywhere[:, 1] > 96)], *SIZE) == ("top left",)
+    rows = tuple(map(tuple, MATRIX.tolist()))
+    model = LensModel(width=640, height=480, camera_matrix=rows, dist_coeffs=tuple(DISTORTION.tolist()))
+    inside = everywhere[(everywhere[:, 0] > 130) | (everywhere[:, 1] > 96)]
+    for corners, named in ((everywhere, ()), (inside, ("top left",))):
+        assert LensCalibration(model, 0.1, {}, (), corners, corners, ()).uncovered == named
 
 
 def test_grey_of_a_mosaic_balances_colours() -> None:

@@ -218,11 +218,11 @@ def test_memory_is_bounded_while_no_announcement_comes() -> None:
     tracemalloc.start()
     for frame in range(0, 12_000, 3000):
         # Four jumps of the clock stand for as many thousand bursts each.
-        receiver._files._waiting += receiver._files._waiting[:1] * 3000
+        receiver._files._open += receiver._files._open[:1] * 3000
         receiver.add(FrameSoftBits(soft.burst + frame, soft.llr))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert sum(burst.llr.size for burst in receiver._files._waiting) <= 32 << 20
+    assert sum(burst.llr.size for burst in receiver._files._open) <= 32 << 20
     assert peak < 64 << 20
 
 

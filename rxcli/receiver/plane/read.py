@@ -95,11 +95,11 @@ def _read_mosaic(frame: Frame, mosaic: Mosaic) -> LightPlane:
     weights = np.tile(weights, (1, cell_px // n_colours))
     n_cells = width // cell_px
     sums = np.zeros((n_cells + 1, height), np.float32)
-    for phase in range(min(period, height)):
-        for top in range(phase, height, BAND_ROWS * period):
-            rows = slice(top, top + BAND_ROWS * period, period)
-            runs = frame.pixels[rows, : n_cells * cell_px].astype(np.float32).reshape(-1, n_cells, cell_px)
-            sums[1:, rows] = (runs @ weights[phase] - offsets[phase] * np.float32(cell_px)).T
+    for top in range(0, height, BAND_ROWS):
+        band = frame.pixels[top : top + BAND_ROWS, : n_cells * cell_px].astype(np.float32)
+        phase = np.arange(top, top + len(band)) % period
+        cells = (band.reshape(len(band), n_cells, cell_px) @ weights[phase, :, None])[:, :, 0]
+        sums[1:, top : top + BAND_ROWS] = (cells - offsets[phase, None] * np.float32(cell_px)).T
     if not is_complete:
         sums = np.asarray(cv2.filter2D(sums, -1, np.array([[0.25, 0.5, 0.25]], np.float32)))
     return LightPlane(running_sums(sums), cell_px, width, 0.0, 1.0, is_linear=True)
