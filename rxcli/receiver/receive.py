@@ -135,7 +135,7 @@ def _receive_screen(
     # Channel and decode, in turn: metrics of slots to symbols, and symbols to the picture.
     with timer("detect"):
         reception = decode_photograph(acquisition, options.skip, found.best.reception)
-        no_header = headerless(reception)
+        no_header, framing = headerless(reception), framing_of(acquisition, reception, found.screens, context)
     with timer("denoise"):
         reception, denoised, report = apply_autoencoder(acquisition, reception, options)
     # Packets, with the probability that they are right.
@@ -146,7 +146,7 @@ def _receive_screen(
             no_header,
             options.min_confidence,
             outline.certainty,
-            framing_of(acquisition, reception, found.screens, context).bursts,
+            framing.bursts,
         ),
         reception.posteriors,
         reception.n_observed,

@@ -1,5 +1,6 @@
 """Frames in, packets or reasons out: small simulated scenes from clean to hopeless, and what no receiver can read."""
 
+import sys
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -20,7 +21,7 @@ from rxcli.receiver import channel, still
 from rxcli.receiver.channel import denoise
 from rxcli.receiver.decode import detect
 from rxcli.receiver.frame.cache import FrameCache
-from rxcli.receiver.frame.passes import headerless
+from rxcli.receiver.frame.passes import Reception, headerless
 from rxcli.receiver.plane.orientation import as_received
 from rxcli.receiver.receive import receive, receive_frame
 from rxcli.receiver.search import Found, search
@@ -268,6 +269,18 @@ def test_the_network_is_shown_what_its_time_allows(
     report = received(frame_of(taken), options_for(taken)).denoiser
     assert shown == [report["columns"]]
     assert least <= shown[0] <= most
+
+
+def test_the_network_has_no_say_in_the_length_of_packets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It knows where headers are, so what it corrected fits the length that was assumed."""
+    seen: list[Reception] = []
+    receiving = sys.modules["rxcli.receiver.receive"]
+    framing_of, apply = receiving.framing_of, receiving.apply_autoencoder
+    monkeypatch.setattr(receiving, "framing_of", lambda a, r, *rest: (seen.append(r), framing_of(a, r, *rest))[1])
+    monkeypatch.setattr(receiving, "apply_autoencoder", lambda a, r, options: (seen.append(r), apply(a, r, options))[1])
+    taken = overexposed()
+    assert received(frame_of(taken), options_for(taken)).denoiser["columns"] > 0
+    assert all(judged is shown for judged, shown in zip(seen[::2], seen[1::2], strict=True))
 
 
 def test_weights_that_differ_by_column() -> None:
