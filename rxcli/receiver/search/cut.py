@@ -77,22 +77,23 @@ def cut_packets(context: FrameContext, outlines: Sequence[Outline]) -> tuple[Fra
 def _best(context: FrameContext, outlines: Sequence[Outline]) -> Iterator[_Slots]:
     """The slots that stand out most, of each rate by a known camera, in two directions by an unknown one."""
     found = _found(context, outlines)
-    if context.camera.profile is not None and all(slots.lead < SETTINGS.poor_lead for slots in found):
+    if context.camera.profile is not None and all(slots.lead < SETTINGS.poor_lead for slots, _ in found):
         # What a profile states is off by a per cent.
         found += _found(replace(context, camera=UNKNOWN), outlines)
-    best: dict[float, _Slots] = {}
-    for slots in sorted(found, key=lambda slots: slots.lead):
-        best[0.0 if slots.context.camera.hypothesis else slots.screens[0].slot_rate_hz] = slots
-    for slots in best.values():
+    best: dict[float, tuple[_Slots, Outline]] = {}
+    for slots, outline in sorted(found, key=lambda each: each[0].lead):
+        best[0.0 if slots.context.camera.hypothesis else slots.screens[0].slot_rate_hz] = slots, outline
+    for each in best.values():
+        slots = _settled(*each)
         yield slots
         if slots.context.camera.hypothesis is not None:
             yield _backwards(slots)
 
 
-def _found(context: FrameContext, outlines: Sequence[Outline]) -> list[_Slots]:
-    """The slots by every outline and camera."""
+def _found(context: FrameContext, outlines: Sequence[Outline]) -> list[tuple[_Slots, Outline]]:
+    """The slots by every outline and camera, and the outline."""
     return [
-        _settled(slots, outline)
+        (slots, outline)
         for outline in outlines
         for by_camera in _cameras(replace(context, sampled_corners=outline.corners))
         for slots in _slots_by(by_camera)
