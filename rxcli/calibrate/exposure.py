@@ -91,9 +91,8 @@ def _from_wave(
         agrees = abs(np.log(nearest[0] * period_s / exif_exposure_s)) <= np.log(_EXIF_RATIO)
         part, sd = nearest if agrees else (edge, edge_sd)
         stated = f"{exif_exposure_s:.4g} s"
-        comment = (
-            f"agrees with the file's {stated}" if agrees else f"the file states {stated}, which the edges contradict"
-        )
+        comments = f"the file states {stated}, which the edges contradict", f"agrees with the file's {stated}"
+        comment = comments[agrees]
     interval = max(part - Z95 * sd, 0.0) * period_s, (part + Z95 * sd) * period_s
     return ExposureEstimate(part * period_s, interval, comment)
 

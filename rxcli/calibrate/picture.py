@@ -35,9 +35,7 @@ def write_residuals(calibration: LensCalibration, path: Path) -> None:
         cv2.line(canvas, start.tolist(), end.tolist(), colour, 1, cv2.LINE_AA)
         cv2.circle(canvas, start.tolist(), 2, colour, -1, cv2.LINE_AA)
     cv2.line(canvas, (20, height + 30), (20 + _ARROW_PX, height + 30), (0, 0, 0), 2)
-    text = (
-        f"{scale:g} px    RMS {calibration.rms_px:.3f} px, {len(corners)} corners of "
-        f"{len(calibration.accepted)} boards; grey: no corners"
-    )
+    found = f"{len(corners)} corners of {len(calibration.accepted)} boards; grey: no corners"
+    text = f"{scale:g} px    RMS {calibration.rms_px:.3f} px, {found}"
     cv2.putText(canvas, text, (100, height + 36), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
     write_whole(path, encode_png(canvas))

@@ -294,11 +294,8 @@ def calibrate_shutter(
     regions = [replace(s, picture=i) for i, (of, found) in enumerate(by_picture) if of == along for s in found]
     if not regions:
         where = "the picture" if len(pictures) == 1 else f"any of {len(pictures)} pictures"
-        raise ReceiverError(
-            f"no stripes of a blinking lamp in {where}",
-            "let the lamp fill more of the frame, shorten the exposure to well below half a period, and use the "
-            "electronic shutter with HDR and flicker reduction off",
-        )
+        hint = "let the lamp fill more of the frame, expose for well below half a period, by the electronic shutter"
+        raise ReceiverError(f"no stripes of a blinking lamp in {where}", f"{hint}, without HDR and flicker reduction")
     reference = _common_line_delay(regions, frequencies_hz)
     lamps = [replace(s, frequency_hz=_match(s, frequencies_hz, reference)) for s in regions]
     used = [(lamp, lamp.frequency_hz) for lamp in lamps if lamp.frequency_hz]
@@ -315,10 +312,8 @@ def _doubts(result: ShutterCalibration, *, is_coded: bool) -> tuple[str, ...]:
     """Why the stripes may be none of a lamp, of a picture that may have been coded in blocks."""
     doubts = []
     if result.readout_s > _LONG_READOUT_S:
-        doubts.append(
-            f"a readout of {1e3 * result.readout_s:.0f} ms is longer than that of nearly all cameras: the stripes may "
-            "be texture"
-        )
+        readout = f"a readout of {1e3 * result.readout_s:.0f} ms"
+        doubts.append(f"{readout} is longer than that of nearly all cameras: the stripes may be texture")
     for lamp in result.lamps if is_coded else ():
         block = next((px for px in _BLOCKS_PX if abs(lamp.period_px / px - 1) < _SAME_PERIOD), None)
         if lamp.frequency_hz and block:
@@ -343,12 +338,10 @@ def _common_line_delay(regions: list[Stripes], frequencies_hz: Sequence[float]) 
     n_used, weight, chosen = max(proposals)
     rivals = [p for p in proposals if p[0] == n_used and abs(np.log(p[2] / chosen)) > _SAME_LINE_DELAY]
     if len(set(frequencies_hz)) > 1 and any(p[1] > weight / 2 for p in rivals):
-        periods = ", ".join(f"{period:.4g}" for period in sorted(s.period_px for s in regions))
-        raise ReceiverError(
-            f"the lamps that were found (periods of {periods} px) fit the frequencies given in more than one "
-            f"way: {chosen * 1e6:.4g} or {max(rivals)[2] * 1e6:.4g} us a row",
-            "give the frequencies of these lamps alone, or let all of the lamps show",
-        )
+        lamps = "lamps of periods of " + ", ".join(f"{px:.4g}" for px in sorted(s.period_px for s in regions)) + " px"
+        ways = f"{chosen * 1e6:.4g} or {max(rivals)[2] * 1e6:.4g} us a row"
+        reason = f"{lamps} were found, which fit the frequencies given in more than one way: {ways}"
+        raise ReceiverError(reason, "give the frequencies of these lamps alone, or let all of the lamps show")
     return chosen
 
 

@@ -104,9 +104,8 @@ class Directories:
             numbers: tuple[float, ...] = self._numbers(entry, _NUMBERS)
         elif entry[1] in _FRACTIONS:
             parts = self._numbers(entry, _FRACTIONS)
-            numbers = tuple(
-                above / below if below else nan for above, below in zip(parts[::2], parts[1::2], strict=True)
-            )
+            fractions = zip(parts[::2], parts[1::2], strict=True)
+            numbers = tuple(above / below if below else nan for above, below in fractions)
         else:
             return self._content(entry)
         return numbers[0] if len(numbers) == 1 else numbers

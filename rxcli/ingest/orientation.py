@@ -11,22 +11,13 @@ from numpy.typing import NDArray
 
 _T = TypeVar("_T", bound=np.generic)
 
-#: Orientation -> (quarter turns counter-clockwise, then mirrored left to right).
-_TURNS = {
-    1: (0, False),
-    2: (0, True),
-    3: (2, False),
-    4: (2, True),
-    5: (3, True),
-    6: (3, False),
-    7: (1, True),
-    8: (1, False),
-}
+#: Quarter turns counter-clockwise, and whether then mirrored left to right, of orientations 1 to 8.
+_TURNS = ((0, False), (0, True), (2, False), (2, True), (3, True), (3, False), (1, True), (1, False))
 
 
 def as_stored(viewed: NDArray[_T], orientation: int) -> NDArray[_T]:
     """A view of the picture as it is stored, from one as a viewer sees it, (height, width, ...)."""
-    turns, mirrored = _TURNS[orientation]
+    turns, mirrored = _TURNS[orientation - 1]
     return np.rot90(viewed[:, ::-1] if mirrored else viewed, -turns)
 
 
@@ -34,7 +25,7 @@ def orientation_of(transform: Callable[[NDArray[np.int64]], NDArray[np.int64]]) 
     """The orientation that turns pictures as `transform` (a composition of turns and mirrors) does."""
     probe = np.arange(6).reshape(2, 3)
     transformed = transform(probe)
-    return next(o for o in _TURNS if np.array_equal(as_stored(transformed, o), probe))
+    return next(o for o in range(1, 9) if np.array_equal(as_stored(transformed, o), probe))
 
 
 def orientation_of_turn(degrees_ccw: float) -> int:

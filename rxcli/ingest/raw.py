@@ -49,9 +49,8 @@ def read_raw(path: Path) -> Frame:
     except rawpy.LibRawFileUnsupportedError:
         raise InputError(*_unsupported(path)) from None
     except (rawpy.LibRawError, RuntimeError, OSError, MemoryError, ValueError) as error:
-        raise InputError(
-            f"{path}: the RAW file is damaged or cut ({_libraw_reason(error)})", "copy the file again"
-        ) from None
+        reason = f"{path}: the RAW file is damaged or cut ({_libraw_reason(error)})"
+        raise InputError(reason, "copy the file again") from None
     check_size(path, raw.sizes.width, raw.sizes.height)
     top, left, height, width = default_crop(raw.sizes)
     pixels = image[top : top + height, left : left + width]
@@ -112,10 +111,8 @@ def _channel_colours(raw: Any, path: Path) -> NDArray[np.uint8]:
     """(4,) colour (0 red, 1 green, 2 blue) of LibRaw's channels; a Bayer mosaic has two green ones."""
     colours = ["RGB".find(chr(letter)) for letter in raw.color_desc[:4]]
     if min(colours) < 0:
-        reason = (
-            f"{path}: the sensor's colours are {raw.color_desc.decode('ascii', 'replace')}, not red, green and blue"
-        )
-        raise InputError(reason, "use the JPEG")
+        named = raw.color_desc.decode("ascii", "replace")
+        raise InputError(f"{path}: the sensor's colours are {named}, not red, green and blue", "use the JPEG")
     return np.array(colours, np.uint8)
 
 

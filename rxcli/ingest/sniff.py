@@ -11,20 +11,18 @@ from rxcli.errors import InputError, reason_of
 
 Kind = Literal["jpeg", "png", "tiff", "heif", "other_image", "raw", "video", "device"]
 
-IMAGE_SUFFIXES = frozenset(
-    {".jpg", ".jpeg", ".jpe", ".jfif", ".mpo", ".png", ".tif", ".tiff", ".heic", ".heif", ".hif", ".bmp", ".webp"}
+
+def _suffixes(names: str) -> frozenset[str]:
+    return frozenset(f".{name}" for name in names.split())
+
+
+IMAGE_SUFFIXES = _suffixes("jpg jpeg jpe jfif mpo png tif tiff heic heif hif bmp webp")
+RAW_SUFFIXES = _suffixes(
+    "raf dng arw sr2 srf nef nrw cr2 cr3 crw orf rw2 raw pef srw x3f 3fr fff iiq erf mef mos mrw kdc dcr rwl gpr"
 )
-# fmt: off
-RAW_SUFFIXES = frozenset({
-    ".raf", ".dng", ".arw", ".sr2", ".srf", ".nef", ".nrw", ".cr2", ".cr3", ".crw", ".orf", ".rw2", ".raw", ".pef",
-    ".srw", ".x3f", ".3fr", ".fff", ".iiq", ".erf", ".mef", ".mos", ".mrw", ".kdc", ".dcr", ".rwl", ".gpr",
-})
-# fmt: on
 #: Of JPEGs in a row: each begins like a photograph.
-MJPEG_SUFFIXES = frozenset({".mjpeg", ".mjpg"})
-VIDEO_SUFFIXES = MJPEG_SUFFIXES | {
-    *(".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".3gp")
-}
+MJPEG_SUFFIXES = _suffixes("mjpeg mjpg")
+VIDEO_SUFFIXES = MJPEG_SUFFIXES | _suffixes("mp4 mov m4v mkv avi webm mts m2ts ts mpg 3gp")
 #: Suffixes, lower case with their dot, of the files that are looked at in folders.
 KNOWN_SUFFIXES = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
 
@@ -74,9 +72,7 @@ def check_file(path: Path) -> Kind | None:
             raise InputError(reason, "name the file itself, or mend the link") from None
         raise InputError(f"{path}: no such file", "check the name") from None
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"{path}: cannot be looked at ({reason_of(error)})", "check the name and the permissions"
-        ) from None
+        raise InputError(f"{path}: cannot be looked at ({reason_of(error)})", "check name and permissions") from None
     if stat.S_ISCHR(info.st_mode):
         return "device"
     if stat.S_ISDIR(info.st_mode):

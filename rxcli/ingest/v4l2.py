@@ -331,9 +331,8 @@ def _explained(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        kind, reason, step = _FAILURES.get(
-            error.errno or 0, (CameraLost, f"the camera failed ({error.strerror})", _PLUG)
-        )
+        unknown = (CameraLost, f"the camera failed ({error.strerror})", _PLUG)
+        kind, reason, step = _FAILURES.get(error.errno or 0, unknown)
         raise kind(f"{path}: {reason}", step.format(path=path)) from None
 
 

@@ -275,9 +275,8 @@ def _colours(frame: Any, luma: NDArray[Any], black: float, white: float) -> Colo
         import cv2
 
         size = (luma.shape[1] // THINNED, luma.shape[0] // THINNED)
-        y, b, r = (
-            cv2.resize(plane, size, interpolation=cv2.INTER_AREA).astype(np.float32) for plane in (luma, blue, red)
-        )
+        small = (cv2.resize(plane, size, interpolation=cv2.INTER_AREA) for plane in (luma, blue, red))
+        y, b, r = (plane.astype(np.float32) for plane in small)
         y = (y - black) / full
         r, b = y + (r - middle) * (2 * (1 - of_red) / chroma), y + (b - middle) * (2 * (1 - of_blue) / chroma)
         return np.asarray(np.stack([r, (y - of_red * r - of_blue * b) / of_green, b], axis=-1), np.float32)
@@ -343,10 +342,9 @@ def _check_whole(path: Path, container: Any, stream: Any, progress: _Progress) -
         reason = f"{path}: the clip breaks off at {progress.last_time_s:.3f} s"
         raise InputError(reason, "the frames before were read; copy the file from the camera again")
     if progress.n_damaged:
-        reason = f", the first after {progress.broken_at_s:.3f} s" + (
-            f" ({progress.reason})" if progress.reason else ""
-        )
-        raise InputError(f"{path}: {progress.n_damaged} frames are damaged{reason}", "copy the file again")
+        cause = f" ({progress.reason})" if progress.reason else ""
+        reason = f"{path}: {progress.n_damaged} frames are damaged, the first after {progress.broken_at_s:.3f} s{cause}"
+        raise InputError(reason, "copy the file again")
 
 
 def _open_failure(path: Path, error: Exception) -> tuple[str, str]:

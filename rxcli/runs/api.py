@@ -136,10 +136,8 @@ def frame_of_array(pixels: NDArray[Any]) -> Frame:
     is_array = isinstance(pixels, np.ndarray)
     if not is_array or pixels.ndim != 2 or not pixels.size or pixels.dtype not in (np.uint8, np.uint16):
         shown = f"{pixels.shape} of {pixels.dtype}" if is_array else type(pixels).__name__
-        raise UsageError(
-            f"a picture must be a path, a Frame or a (height, width) array of uint8 or uint16 (got {shown})",
-            "of a colour picture take the green channel, or its luma; convert lists and others to such an array",
-        )
+        reason = f"a picture must be a path, a Frame or a (height, width) array of uint8 or uint16 (got {shown})"
+        raise UsageError(reason, "of a colour picture take the green channel or luma; convert lists to such an array")
     return Frame(pixels, "array", white=float(np.iinfo(pixels.dtype).max))
 
 

@@ -126,11 +126,8 @@ def _decode(decoder: Decoder, source: Source) -> _Outcome:
 
 def _folders(decoder: Decoder) -> dict[str, Path]:
     """Where taps go, by the option that names it."""
-    folders = {
-        "--dump-dir": getattr(decoder.options, "dump_dir", None),
-        "--save-undistorted": getattr(decoder.tap, "folder", None),
-    }
-    return {option: folder for option, folder in folders.items() if folder is not None}
+    places = (("--dump-dir", decoder.options, "dump_dir"), ("--save-undistorted", decoder.tap, "folder"))
+    return {option: folder for option, of, name in places if (folder := getattr(of, name, None)) is not None}
 
 
 def _tapping_into(decoder: Decoder, option: str, folder: Path) -> Decoder:
@@ -168,9 +165,8 @@ def _await(source: Source, future: Any, address: str) -> _Outcome:
         message = f"{source.name}: every worker that decoded it died; try it by itself"
         return [replace(unreadable(source, 0, message), retry=True)], []
     except (OSError, CancelledError) as error:
-        raise InputError(
-            f"the scheduler at {address!r} went away ({type(error).__name__})", "start it again and use --resume"
-        ) from None
+        reason = f"the scheduler at {address!r} went away ({type(error).__name__})"
+        raise InputError(reason, "start it again and use --resume") from None
     except ReceiverError:
         raise
     except Exception as error:  # what a worker raises that cannot even load the task

@@ -236,10 +236,8 @@ def _check_same(path: Path, head: Head, run: object) -> None:
         problems = _differences(before, after)
     if problems:
         more = f" (and {len(problems) - 3} other differences)" if len(problems) > 3 else ""
-        raise UsageError(
-            f"{path}: cannot be resumed, results would not go together: {'; '.join(problems[:3])}{more}",
-            "run it with the same options, or name another file with --json",
-        )
+        reason = f"{path}: cannot be resumed, results would not go together: {'; '.join(problems[:3])}{more}"
+        raise UsageError(reason, "run it with the same options, or name another file with --json")
 
 
 def _has_changed(source: str, facts: object, paths: Mapping[str, str]) -> bool:

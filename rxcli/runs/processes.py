@@ -15,15 +15,9 @@ if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
 
 #: Read by libraries when they are loaded: how many threads of their own they start.
-THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "OPENCV_FOR_THREADS_NUM",
-)
+_VARIABLES = "OMP_NUM_THREADS OPENBLAS_NUM_THREADS MKL_NUM_THREADS VECLIB_MAXIMUM_THREADS OPENCV_FOR_THREADS_NUM"
 #: A process whose libraries start no threads of their own.
-ONE_THREAD = dict.fromkeys(THREAD_VARIABLES, "1")
+ONE_THREAD = dict.fromkeys(_VARIABLES.split(), "1")
 _STARTING = Lock()
 
 
