@@ -30,11 +30,7 @@ class ExposureEstimate:
 
 
 def estimate_exposure(
-    fit: PeriodicFit,
-    profile: FloatArray,
-    line_delay_s: float,
-    exif_exposure_s: float | None = None,
-    tone_known: bool = True,
+    fit: PeriodicFit, profile: FloatArray, line_delay_s: float, exif_exposure_s: float | None, tone_known: bool
 ) -> ExposureEstimate:
     """Exposure from the rise and fall of a switched lamp's stripes.
 
@@ -46,7 +42,7 @@ def estimate_exposure(
         fit: the region's fit.
         profile: (n,) the values fitted, proportional to light.
         line_delay_s: time between rows.
-        exif_exposure_s: exposure in the file.
+        exif_exposure_s: exposure in the file, None where it states none.
         tone_known: whether the profile is known to be proportional to light; if not, the interval includes the result
             for a display's tone curve.
     """

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from rxcli.profiles import LensModel
 from rxcli.types import FloatArray
 
+_Map = Callable[[FloatArray], FloatArray]
 #: Two-sided 95 % quantile of the normal distribution.
 Z95 = 1.959964
 #: Residual, in standard deviations, from which values weigh less (Huber).
@@ -31,12 +32,7 @@ class Fit:
         return np.asarray(np.linalg.pinv(self.jacobian.T @ self.jacobian) * variance)
 
 
-def least_squares(
-    residual: Callable[[FloatArray], FloatArray],
-    start: ArrayLike,
-    jacobian: Callable[[FloatArray], FloatArray] | None = None,
-    **options: Any,
-) -> Fit:
+def least_squares(residual: _Map, start: ArrayLike, jacobian: _Map | None = None, **options: Any) -> Fit:
     """Minimise the sum of squared residuals by Levenberg-Marquardt.
 
     Args:

@@ -8,6 +8,7 @@ import io
 import math
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -77,11 +78,9 @@ def is_raw_tiff(path: Path) -> bool:
 
 def raw_metadata(path: Path) -> Metadata:
     """Metadata of a RAW file, from its own directories or the JPEG inside."""
-    try:
-        with path.open("rb") as file:
-            return _raw_metadata(file)
-    except (OSError, struct.error):
-        return Metadata()
+    with suppress(OSError, struct.error), path.open("rb") as file:
+        return _raw_metadata(file)
+    return Metadata()
 
 
 def clip_metadata(tags: Mapping[str, str]) -> Metadata:
@@ -126,8 +125,6 @@ def _raw_metadata(file: BinaryIO) -> Metadata:
         head += file.read(_HEADER_BYTES - HEAD)
         found = head.find(b"CMT1")  # the box of IFD0; LibRaw states the exposure
         return exif_metadata(head[found + 4 :]) if found >= 0 else Metadata()
-    if head[:4] in (b"IIRO", b"IIRS", b"IIU\0"):  # TIFF but for the magic number
-        return tiff_metadata(io.BytesIO(b"II*\0" + head[4:] + file.read(_HEADER_BYTES - HEAD)))
     return tiff_metadata(file)
 
 

@@ -38,6 +38,8 @@ log = logging.getLogger(__name__)
 
 OpenSource = Callable[[str], Iterable[Frame]]
 Receive = Callable[[Iterable[Frame], Any], Iterator[FrameResult]]
+Tap = Callable[[Frame, str], None] | None
+After = Callable[[FrameResult, str], None] | None
 #: One source with its results, which are to be taken before the next source is asked for.
 Decoded = tuple["Source", Iterator[FrameResult]]
 
@@ -135,9 +137,9 @@ class Decoder:
     open_source: OpenSource
     receive: Receive
     #: Sees every frame before it is received, and the subfolder of its source.
-    tap: Callable[[Frame, str], None] | None = None
+    tap: Tap = None
     #: Sees every result, and the subfolder of its source.
-    after: Callable[[FrameResult, str], None] | None = None
+    after: After = None
     #: Screens whose messages and files are looked for; empty: none are.
     link_screens: tuple[ScreenProfile, ...] = ()
     #: Bound of all files under way, 2^20 bytes.
@@ -243,11 +245,7 @@ def with_last(results: Iterator[FrameResult]) -> Iterator[tuple[FrameResult, boo
         yield held, True
 
 
-def standard_decoder(
-    options: ReceiverOptions,
-    tap: Callable[[Frame, str], None] | None = None,
-    after: Callable[[FrameResult, str], None] | None = None,
-) -> Decoder:
+def standard_decoder(options: ReceiverOptions, tap: Tap = None, after: After = None) -> Decoder:
     """The decoder that reads files and receives them."""
     screens = options.screens if options.soft_bits else ()
     return Decoder(options, open_source, _receive, tap, after, screens, options.file_memory_mb)
