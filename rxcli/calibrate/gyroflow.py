@@ -60,7 +60,11 @@ def load_gyroflow(path: Path, size: tuple[int, int] | None = None) -> GyroflowPr
         InputError: it cannot be read.
         ProfileError: it holds no lens, an impossible one, or one too wide for a pinhole.
     """
-    raw = _load(path)
+    try:
+        raw = json.loads(read_limited(path, _MAX_BYTES))
+    except (OSError, ValueError, RecursionError) as error:
+        reason = getattr(error, "strerror", None) or "it is no JSON"
+        raise InputError(f"{path}: cannot be read as a Gyroflow profile ({reason})", "name a lens profile") from None
     try:
         matrix, coefficients, calibrated = _calibrated(raw)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError):
@@ -74,19 +78,6 @@ def load_gyroflow(path: Path, size: tuple[int, int] | None = None) -> GyroflowPr
     lens, worst = fit_distortion(rays, points, matrix[[0, 1], [0, 1]], matrix[:2, 2], size)
     make, model, lens_name = (text_of(raw.get(key)) or "" for key in ("camera_brand", "camera_model", "lens_model"))
     return GyroflowProfile(lens, make, model, lens_name, worst, *_readout(raw))
-
-
-def _load(path: Path) -> dict[str, Any]:
-    try:
-        raw = json.loads(read_limited(path, _MAX_BYTES))
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file", "check the name") from None
-    except (OSError, ValueError, RecursionError) as error:
-        reason = getattr(error, "strerror", None) or "it is no JSON"
-        raise InputError(f"{path}: cannot be read as a Gyroflow profile ({reason})", "name a lens profile") from None
-    if not isinstance(raw, dict):
-        raise ProfileError(f"{path}: is no Gyroflow profile", "name a lens profile (.json)")
-    return raw
 
 
 def _calibrated(raw: dict[str, Any]) -> tuple[FloatArray, FloatArray, tuple[int, int]]:

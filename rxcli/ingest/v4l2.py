@@ -121,43 +121,33 @@ class CameraLost(InputError):
     """A camera that is missing, busy, silent or unplugged: it may come back."""
 
 
+@dataclass(slots=True, eq=False)
 class LiveSource:
-    """Frames of a camera, over as many connections as it takes; iterate over it once.
+    """Frames of a camera, over as many connections as it takes; iterate over it once."""
 
-    Args:
-        path: the device, `/dev/video0`.
-        settings: requested mode and controls.
-        on_lost: called with the reason when waiting begins.
-        duration_s: time limit from the request of the first frame, seconds; None: no limit.
-        on_idle: called regularly while no whole frame arrives.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        settings: CameraSettings | None = None,
-        on_lost: Callable[[str], None] | None = None,
-        duration_s: float | None = None,
-        on_idle: Callable[[], None] | None = None,
-    ) -> None:
-        self.settings = settings or CameraSettings()
-        self.counts = CameraCounts()
-        #: How the camera is driven, None before it answers.
-        self.mode: Mode | None = None
-        self._path = path
-        self._on_lost = on_lost or (lambda reason: None)
-        self._duration_s = math.inf if duration_s is None else duration_s
-        self._on_idle = on_idle or (lambda: None)
+    #: The device, `/dev/video0`.
+    path: Path
+    #: Requested mode and controls.
+    settings: CameraSettings = CameraSettings()
+    #: Called with the reason when waiting begins.
+    on_lost: Callable[[str], None] = lambda reason: None
+    #: Time limit from the request of the first frame; None: no limit.
+    duration_s: float | None = None
+    #: Called regularly while no whole frame arrives.
+    on_idle: Callable[[], None] = lambda: None
+    #: How the camera is driven, None before it answers.
+    mode: Mode | None = None
+    counts: CameraCounts = field(default_factory=CameraCounts)
 
     def __iter__(self) -> Generator[Frame, None, None]:
-        end_s, is_waiting = time.monotonic() + self._duration_s, False
+        is_waiting, end_s = False, time.monotonic() + (math.inf if self.duration_s is None else self.duration_s)
         while time.monotonic() < end_s:
             try:
-                with closing(Camera(self._path, self.settings, self.counts)) as camera:
+                with closing(Camera(self.path, self.settings, self.counts)) as camera:
                     self.mode, is_waiting = camera.mode, False
                     for frame in camera:
                         if frame is None:
-                            self._on_idle()
+                            self.on_idle()
                         else:
                             yield frame
                         if time.monotonic() >= end_s:
@@ -166,10 +156,10 @@ class LiveSource:
                 if not self.settings.wait:
                     raise
                 if not is_waiting:
-                    self._on_lost(str(error))
+                    self.on_lost(str(error))
                 is_waiting = True
                 time.sleep(min(_RETRY_S, max(end_s - time.monotonic(), 0.0)))
-                self._on_idle()
+                self.on_idle()
 
 
 class Camera:
