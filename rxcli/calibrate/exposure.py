@@ -1,10 +1,11 @@
 """Exposure from the blur of a lamp's edges: a switched lamp through an exposure is a trapezoid in every period."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from rxcli.calibrate.fitting import Z95, least_squares
+from rxcli.calibrate.fitting import Z95
 from rxcli.calibrate.periodic import PeriodicFit, fit_periodic
 from rxcli.types import FloatArray
 
@@ -61,17 +62,21 @@ def _from_wave(
     fit: PeriodicFit, profile: FloatArray, line_delay_s: float, exif_exposure_s: float | None
 ) -> ExposureEstimate:
     """Exposure from values assumed proportional to light."""
+    from scipy.optimize import least_squares
+
     usable = fit.envelope > 0.2 * fit.envelope.max()
     wave = ((profile - fit.mean) / np.where(usable, fit.envelope, 1))[usable]
     phase = np.asarray((fit.frequency * (fit.first_row + np.flatnonzero(usable) - fit.origin)) % 1, np.float64)
     start = _start(phase, wave)
-    shape = None if start is None else least_squares(lambda state: _trapezoid(phase, state) - wave, start)
+    options = {"jac": "3-point", "method": "lm", "x_scale": "jac", "xtol": 1e-10}
+    shape: Any = start and least_squares(lambda state: _trapezoid(phase, state) - wave, start, **options)
     total = max(float(np.sum((wave - wave.mean()) ** 2)), 1e-300)
-    if shape is None or 1 - float(np.sum(shape.residual**2)) / total < _MIN_EXPLAINED:
+    if shape is None or 1 - float(shape.fun @ shape.fun) / total < _MIN_EXPLAINED:
         return ExposureEstimate(None, None, "the lamp is not switched on and off sharply, or the picture is too noisy")
-    rise, fall, edge = (float(value) for value in shape.state[:3])
+    rise, fall, edge = (float(value) for value in shape.x[:3])
     edge, lit = abs(edge), (fall - rise) % 1
-    covariance = shape.covariance()
+    variance = float(shape.fun @ shape.fun) / max(wave.size - shape.x.size, 1)
+    covariance = np.linalg.pinv(shape.jac.T @ shape.jac) * variance
     edge_sd = float(np.sqrt(covariance[2, 2]))
     lit_sd = float(np.sqrt(max(covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1], 0)))
     if edge > _MAX_EDGE or min(lit, 1 - lit) - edge < _MIN_PLATEAU:
@@ -84,11 +89,9 @@ def _from_wave(
     if exif_exposure_s is not None:
         parts = [(edge, edge_sd), (lit, lit_sd), (1 - lit, lit_sd)]
         nearest = min(parts, key=lambda p: abs(np.log(p[0] * period_s / exif_exposure_s)))
-        agrees = abs(np.log(nearest[0] * period_s / exif_exposure_s)) <= np.log(_EXIF_RATIO)
-        part, sd = nearest if agrees else (edge, edge_sd)
-        stated = f"{exif_exposure_s:.4g} s"
-        comments = f"the file states {stated}, which the edges contradict", f"agrees with the file's {stated}"
-        comment = comments[agrees]
+        comment = f"the file states {exif_exposure_s:.4g} s, which the edges contradict"
+        if abs(np.log(nearest[0] * period_s / exif_exposure_s)) <= np.log(_EXIF_RATIO):
+            (part, sd), comment = nearest, f"agrees with the file's {exif_exposure_s:.4g} s"
     interval = max(part - Z95 * sd, 0.0) * period_s, (part + Z95 * sd) * period_s
     return ExposureEstimate(part * period_s, interval, comment)
 

@@ -1,8 +1,4 @@
-"""The one nonlinear least-squares fit of the calibrations, and what it combines and converts."""
-
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+"""Means, grids and lens models that several calibrations need."""
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,42 +6,10 @@ from numpy.typing import ArrayLike
 from rxcli.profiles import LensModel
 from rxcli.types import FloatArray
 
-_Map = Callable[[FloatArray], FloatArray]
 #: Two-sided 95 % quantile of the normal distribution.
 Z95 = 1.959964
 #: Residual, in standard deviations, from which values weigh less (Huber).
 _HUBER = 1.5
-
-
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """State (p,), residual (n,) and Jacobian (n, p) at the least-squares solution."""
-
-    state: FloatArray
-    residual: FloatArray
-    jacobian: FloatArray
-
-    def covariance(self) -> FloatArray:
-        """(p, p) covariance of the state under white noise as large as the residual."""
-        freedom = max(self.residual.size - self.state.size, 1)
-        variance = float(self.residual @ self.residual) / freedom
-        return np.asarray(np.linalg.pinv(self.jacobian.T @ self.jacobian) * variance)
-
-
-def least_squares(residual: _Map, start: ArrayLike, jacobian: _Map | None = None, **options: Any) -> Fit:
-    """Minimise the sum of squared residuals by Levenberg-Marquardt.
-
-    Args:
-        residual: state (p,) to residual (n,).
-        start: (p,) initial state.
-        jacobian: state to (n, p) derivative of the residual; None: central differences.
-        options: further arguments of `scipy.optimize.least_squares`, such as `max_nfev`.
-    """
-    from scipy.optimize import least_squares as solve
-
-    options = {"method": "lm", "x_scale": "jac", "xtol": 1e-10, **options}
-    found = solve(residual, start, jac=jacobian or "3-point", **options)
-    return Fit(found.x, found.fun, found.jac)
 
 
 def weighted_mean(values: ArrayLike, sds: ArrayLike) -> tuple[float, float]:

@@ -228,17 +228,15 @@ def calibrate_lens(found: Iterable[Sighting | Rejected], width: int, height: int
 
 def _fit(boards: list[Sighting], rejected: list[Rejected], size: tuple[int, int]) -> LensCalibration:
     points, corners = [s.points for s in boards], [s.corners for s in boards]
+    hint = "take pictures with the board tilted in different directions and out to the corners"
     try:
         solved = cv2.calibrateCameraExtended(points, corners, size, np.eye(3), np.zeros(5))
     except cv2.error as error:
-        reason = f"the boards do not determine a lens ({str(error).strip().splitlines()[-1]})"
-    else:
-        rms, matrix, distortion, rotations, translations, sd, _, view_rms = solved
-        sound = np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) > 0 and np.abs(distortion).max() <= 100
-        reason = "" if sound else "the fitted lens makes no sense (focal length or distortion out of bounds)"
-    if reason:
-        hint = "take pictures with the board tilted in different directions and out to the corners"
-        raise ReceiverError(reason, hint)
+        reason = str(error).strip().splitlines()[-1]
+        raise ReceiverError(f"the boards do not determine a lens ({reason})", hint) from None
+    rms, matrix, distortion, rotations, translations, sd, _, view_rms = solved
+    if not (np.isfinite(matrix).all() and min(matrix[0, 0], matrix[1, 1]) > 0 and np.abs(distortion).max() <= 100):
+        raise ReceiverError("the fitted lens makes no sense (focal length or distortion out of bounds)", hint)
     poses = zip(points, rotations, translations, strict=True)
     projected = [cv2.projectPoints(p, r, t, matrix, distortion)[0].reshape(-1, 2) for p, r, t in poses]
     measured = np.vstack(corners).astype(np.float64)

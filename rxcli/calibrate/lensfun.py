@@ -47,12 +47,11 @@ def lens_from_database(metadata: Metadata, width: int, height: int) -> LensfunMo
     try:
         import lensfunpy
     except ImportError:
-        reason = "the lensfun database needs the package lensfunpy"
-        raise UsageError(reason, "install it with: pip install '.[lensfun]'") from None
+        raise UsageError("the lensfun database needs the package lensfunpy", "pip install '.[lensfun]'") from None
     focal_mm = metadata.focal_length_mm
     if not metadata.model or not focal_mm:
-        reason = "the file states no camera model or no focal length"
-        raise UsageError(reason, "give --camera-model, --lens and --focal-length")
+        hint = "give --camera-model, --lens and --focal-length"
+        raise UsageError("the file states no camera model or no focal length", hint)
     database = lensfunpy.Database()
     camera = _find_camera(database, metadata)
     lens = _find_lens(database, camera, metadata, lensfunpy.LensType.RECTILINEAR)

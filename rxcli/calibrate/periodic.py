@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.calibrate.fitting import least_squares
 from rxcli.types import BoolArray, FloatArray
 
 #: Oversampling of the spectrum in the search.
@@ -137,10 +136,9 @@ def search(profiles: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     whitened = power / (white + scene / np.maximum(frequency, 1 / n) ** 2 + rounding)
     few = power / power.max(axis=1, keepdims=True) * 1e9
     border, last = FEW_PERIODS * _PAD, min(int(MAX_FREQUENCY * _PAD * n), frequency.size - 1)
-    return [
-        _best_harmonics(np.where(whitened > _LINE_POWER, whitened, 0), n, border, last, 0.0),
-        _best_harmonics(few, n, int(MIN_PERIODS * _PAD), border, _FEW_SCORE),
-    ]
+    many = np.where(whitened > _LINE_POWER, whitened, 0)
+    first = int(MIN_PERIODS * _PAD)
+    return [_best_harmonics(many, n, border, last, 0.0), _best_harmonics(few, n, first, border, _FEW_SCORE)]
 
 
 def _best_harmonics(lines: FloatArray, n: int, low: int, high: int, min_score: float) -> tuple[FloatArray, FloatArray]:
@@ -230,6 +228,8 @@ def _fit_near(
     profile: FloatArray, frequency: float, n_harmonics: int, n_slow: int, first_row: int
 ) -> PeriodicFit | None:
     """Slow mean, envelope less its constant 1, harmonics and frequency, fitted together; None where it runs off."""
+    from scipy.optimize import least_squares
+
     n, order = profile.size, np.arange(1, n_harmonics + 1)
     rows, slow = _rows_and_slow(n, n_slow)
     borders = np.cumsum([n_slow, n_slow - 1, n_harmonics, n_harmonics])
@@ -251,25 +251,26 @@ def _fit_near(
     flat = np.hstack([slow, *_waves(rows, frequency, n_harmonics)])
     linear = np.linalg.lstsq(flat, profile, rcond=None)[0]
     start = np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
-    fit = least_squares(residual, start, jacobian, ftol=1e-7, max_nfev=40)
-    if abs(fit.state[-1] - frequency) > 0.6 / n:
+    found = least_squares(residual, start, jacobian, method="lm", x_scale="jac", xtol=1e-10, ftol=1e-7, max_nfev=40)
+    state, left = found.x, found.fun
+    if abs(state[-1] - frequency) > 0.6 / n:
         return None
-    mean, envelope, cosines, sines, *_ = parts(fit.state)
+    mean, envelope, cosines, sines, *_ = parts(state)
     trend = profile - slow @ np.linalg.lstsq(slow, profile, rcond=None)[0]
-    q, r = np.linalg.qr(fit.jacobian)
+    q, r = np.linalg.qr(found.jac)
     influence = q[:, -1] / r[-1, -1]
     return PeriodicFit(
-        frequency=float(fit.state[-1]),
-        frequency_sd=_noise_sd(influence, fit.residual, fit.state.size),
+        frequency=float(state[-1]),
+        frequency_sd=_noise_sd(influence, left, state.size),
         cosines=cosines,
         sines=sines,
         origin=first_row + (n - 1) / 2,
         first_row=first_row,
-        explained=1 - float(fit.residual @ fit.residual) / max(float(trend @ trend), 1e-300),
+        explained=1 - float(left @ left) / max(float(trend @ trend), 1e-300),
         n_slow=n_slow,
         mean=mean,
         envelope=envelope,
-        residual=fit.residual,
+        residual=left,
         influence=influence,
     )
 

@@ -231,11 +231,8 @@ def _seed(strips: FloatArray, free: BoolArray) -> PeriodicFit | None:
 
 def _groups(strips: FloatArray, usable: BoolArray) -> FloatArray:
     """Means over runs of 1, 4 and all strips, where all of a run is usable and not flat."""
-    runs = [
-        slice(start, start + size)
-        for size in sorted({1, 4, len(strips)})
-        for start in range(0, len(strips) - size + 1, max(size // 2, 1))
-    ]
+    sizes = sorted({1, 4, len(strips)})
+    runs = [slice(at, at + n) for n in sizes for at in range(0, len(strips) - n + 1, max(n // 2, 1))]
     means = [strips[run].mean(axis=0) for run in runs if usable[run].all()]
     groups: FloatArray = np.array(means, np.float64).reshape(len(means), strips.shape[1])
     return np.asarray(groups[np.ptp(groups, axis=1) > 1e-9])
@@ -355,11 +352,8 @@ def _match(stripes: Stripes, frequencies_hz: Sequence[float], line_delay_s: floa
 
 def _warnings(lamps: list[Stripes], frequencies_hz: Sequence[float], line_delay_s: float) -> list[str]:
     """What a user should know before trusting the figures."""
-    notes = [
-        f"a lamp at {lamp.bounds} blinks at about {1 / (lamp.period_px * line_delay_s):.4g} Hz, which was not given"
-        for lamp in lamps
-        if lamp.frequency_hz is None
-    ]
+    unknown = [(lamp.bounds, 1 / (lamp.period_px * line_delay_s)) for lamp in lamps if lamp.frequency_hz is None]
+    notes = [f"a lamp at {box} blinks at about {hz:.4g} Hz, which was not given" for box, hz in unknown]
     missing = set(frequencies_hz) - {lamp.frequency_hz for lamp in lamps}
     if missing:
         notes.append("no lamp of " + ", ".join(f"{f:g} Hz" for f in sorted(missing)) + " was seen")
