@@ -3,19 +3,18 @@
 Readers are imported when a file of their kind comes, because each brings a heavy library.
 """
 
-from collections.abc import Callable, Iterator
-from itertools import islice
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
-from threading import Thread
 
 from rxcli.errors import InputError, UsageError
+from rxcli.ingest.ahead import read_ahead
 from rxcli.ingest.sniff import HEAD_BYTES, KNOWN_SUFFIXES, MAX_BYTES, Kind, check_file, check_no_list, read_bytes, sniff
 from rxcli.types import Frame
 
 __all__ = ["KNOWN_SUFFIXES", "MAX_BYTES", "begun", "open_source"]
 
 
-def open_source(path: str | Path) -> Iterator[Frame]:
+def open_source(path: str | Path) -> Generator[Frame, None, None]:
     """Yield the frames of a photo, RAW file, clip or V4L2 device; the source is opened with the first frame.
 
     Args:
@@ -39,29 +38,8 @@ def open_source(path: str | Path) -> Iterator[Frame]:
 
 def begun(path: str) -> Callable[[str], Iterator[Frame]]:
     """`open_source`, which has begun to read one photograph in a thread."""
-    frames, found = open_source(path), list[Frame | Exception]()
-
-    def read() -> None:
-        try:
-            found.extend(islice(frames, 1))
-        except Exception as error:  # raised again where the frame is taken
-            found.append(error)
-
-    thread = Thread(target=read, daemon=True)
-    thread.start()
-
-    def opened(wanted: str) -> Iterator[Frame]:
-        thread.join()
-        if wanted != path or not found:
-            yield from open_source(wanted)
-            return
-        frame = found.pop()
-        if isinstance(frame, Exception):
-            raise frame
-        yield frame
-        yield from frames
-
-    return opened
+    reading = {path: read_ahead(open_source(path))}
+    return lambda wanted: reading.pop(wanted, None) or open_source(wanted)
 
 
 def _kind(path: Path) -> Kind | None:

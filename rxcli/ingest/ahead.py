@@ -16,7 +16,7 @@ _NICER = 5
 
 
 def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]:
-    """Yield the same frames, and then the same exception, while later frames are fetched in a thread.
+    """Fetch frames in a thread from now on, and yield them, and then their exception.
 
     Args:
         frames: generator, which is exhausted or closed in that thread.
@@ -39,17 +39,21 @@ def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, N
 
     thread = Thread(target=fill, name="read-ahead", daemon=True)
     thread.start()
-    try:
-        while isinstance(item := items.get(), Frame):
-            yield item
-        if item is not None:
-            raise item
-    finally:
-        closed.set()
-        with suppress(Empty):  # room for a frame that waits, after which the thread ends
-            while True:
-                items.get_nowait()
-        thread.join()
+
+    def taken() -> Generator[Frame, None, None]:
+        try:
+            while isinstance(item := items.get(), Frame):
+                yield item
+            if item is not None:
+                raise item
+        finally:
+            closed.set()
+            with suppress(Empty):  # room for a frame that waits, after which the thread ends
+                while True:
+                    items.get_nowait()
+            thread.join()
+
+    return taken()
 
 
 def _give_way() -> None:

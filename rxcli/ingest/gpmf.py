@@ -50,17 +50,16 @@ def _readouts(data: bytes) -> Iterator[float]:
 
 def _header(file: BinaryIO) -> bytes:
     """Contents of the box of GPMF in an MP4 file's header, empty where there is none."""
-    place, end = 0, file.seek(0, 2)
-    for name in _BOXES:
-        while True:
-            file.seek(place)
-            head = file.read(16)
-            size = box_size(head)
-            if not size or place >= end:
-                return b""
-            if head[4:8] == name:
-                break
+    place, end, names = 0, file.seek(0, 2), list(_BOXES)
+    while names and place < end:
+        file.seek(place)
+        head = file.read(16)
+        if not (size := box_size(head)):
+            return b""
+        if head[4:8] == names[0]:
+            names.pop(0)
+            place, end = place + (16 if head[:4] == b"\0\0\0\1" else 8), min(place + size, end)
+        else:
             place += size
-        place, end = place + (16 if head[:4] == b"\0\0\0\1" else 8), min(place + size, end)
     file.seek(place)
-    return file.read(min(end - place, _MAX_BYTES))
+    return b"" if names else file.read(min(end - place, _MAX_BYTES))

@@ -158,10 +158,8 @@ def text_of(value: Any) -> str | None:
 
 def positive(value: Any) -> float | None:
     """A number above zero in a file; None for anything else."""
-    if isinstance(value, tuple):
-        value = value[0] if value else None
     try:
-        number = float(value)
+        number = float(next(iter(value), "") if isinstance(value, tuple) else value)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     return number if math.isfinite(number) and number > 0 else None

@@ -295,14 +295,12 @@ def _fields(frame: Frame, decoded: Any, stream: Any, progress: _Progress) -> Ite
 
     Some cameras mark frames so whose rows are one picture: there, neighbouring rows differ less than every other.
     """
-    if not decoded.interlaced_frame:
-        yield frame
-        return
-    if not progress.has_fields:
+    if decoded.interlaced_frame and not progress.has_fields:
         some = frame.pixels[:, :: max(frame.width // _N_COMPARED, 1)].astype(np.int32)
         progress.has_fields = bool(np.abs(some[1:] - some[:-1]).mean() > np.abs(some[2:] - some[:-2]).mean())
-    if not progress.has_fields:
-        progress.doubt = progress.doubt or "interlaced frames, since both fields of them show one instant"
+        if not progress.has_fields:
+            progress.doubt = progress.doubt or "interlaced frames, since both fields of them show one instant"
+    if not (decoded.interlaced_frame and progress.has_fields):
         yield frame
         return
     lower = int(stream.codec_context.field_order in _LOWER_FIRST)

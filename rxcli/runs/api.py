@@ -118,7 +118,7 @@ def _frame_of(picture: Picture) -> Frame:
     if not isinstance(picture, (str, Path)):
         return frame_of_array(picture)
     frames = open_source(picture)
-    with closing(frames):  # type: ignore[type-var]  # a generator
+    with closing(frames):
         frame = next(frames, None)
         if frame is None:
             raise InputError(f"{picture}: no frame in it", "check the file")
