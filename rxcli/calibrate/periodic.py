@@ -136,9 +136,8 @@ def search(profiles: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
     whitened = power / (white + scene / np.maximum(frequency, 1 / n) ** 2 + rounding)
     few = power / power.max(axis=1, keepdims=True) * 1e9
     border, last = FEW_PERIODS * _PAD, min(int(MAX_FREQUENCY * _PAD * n), frequency.size - 1)
-    many = np.where(whitened > _LINE_POWER, whitened, 0)
-    first = int(MIN_PERIODS * _PAD)
-    return [_best_harmonics(many, n, border, last, 0.0), _best_harmonics(few, n, first, border, _FEW_SCORE)]
+    many, lowest = np.where(whitened > _LINE_POWER, whitened, 0), int(MIN_PERIODS * _PAD)
+    return [_best_harmonics(many, n, border, last, 0.0), _best_harmonics(few, n, lowest, border, _FEW_SCORE)]
 
 
 def _best_harmonics(lines: FloatArray, n: int, low: int, high: int, min_score: float) -> tuple[FloatArray, FloatArray]:

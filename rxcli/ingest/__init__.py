@@ -38,8 +38,8 @@ def open_source(path: str | Path) -> Generator[Frame, None, None]:
 
 def begun(path: str) -> Callable[[str], Iterator[Frame]]:
     """`open_source`, which has begun to read one photograph in a thread."""
-    reading = {path: read_ahead(open_source(path))}
-    return lambda wanted: reading.pop(wanted, None) or open_source(wanted)
+    opened = {path: read_ahead(open_source(path))}
+    return lambda wanted: opened.pop(wanted, None) or open_source(wanted)
 
 
 def _kind(path: Path) -> Kind | None:
