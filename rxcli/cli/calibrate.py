@@ -10,19 +10,19 @@ from typing import Any
 import click
 
 from rxcli.calibrate.frames import frame_light
-from rxcli.calibrate.gyroflow import load_gyroflow
+from rxcli.calibrate.gyroflow import GyroflowProfile, load_gyroflow
 from rxcli.calibrate.lens import Board, GrayImage, Rejected, calibrate_lens, find_boards
-from rxcli.calibrate.lensfun import lens_from_database
+from rxcli.calibrate.lensfun import LensfunModel, lens_from_database
 from rxcli.calibrate.picture import write_residuals
 from rxcli.calibrate.saving import profile_to_extend, with_lens, with_mode, write_profile
 from rxcli.calibrate.shutter import ShutterCalibration, calibrate_shutter
 from rxcli.calibrate.slots import calibrate_slots
-from rxcli.cli.common import force_argument, json_output, options, write_json
+from rxcli.cli.common import force_argument, json_output, options, output, refuse, write_json
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.cli.kinds import FILE
 from rxcli.errors import InputError, UsageError
 from rxcli.ingest import KNOWN_SUFFIXES, open_source
-from rxcli.outputs import CAMERA, PICTURE, Output, claim
+from rxcli.outputs import CAMERA, PICTURE, claim
 from rxcli.profiles import NAME, CameraProfile, LensModel, ReadoutMode, ScreenProfile, load_profile
 from rxcli.resources import user_dir
 from rxcli.results.undistort import grey_levels
@@ -57,10 +57,11 @@ class _Results:
 
     def __init__(self, given: dict[str, Any]) -> None:
         save, name, self._json_path, self._force = (given.pop(key) for key in ("save", "name", "json_path", "force"))
-        if name is not None and save is not None:
-            raise UsageError("--save and --name both name the profile to write", "give one of them")
-        if name is not None and not NAME.fullmatch(name):
-            raise UsageError(f"--name {name!r} cannot name a profile", _NAME_HINT)
+        is_wrong = name is not None and not NAME.fullmatch(name)
+        refuse(
+            (None not in (name, save), "--save and --name both name the profile to write", "give one of them"),
+            (is_wrong, f"--name {name!r} cannot name a profile", _NAME_HINT),
+        )
         self._target: Path | None = save if name is None else user_dir() / "cameras" / f"{name}.toml"
 
     def claim(self, read: list[Path], *json_keys: str, screen: str | None = None, picture: Path | None = None) -> None:
@@ -72,8 +73,8 @@ class _Results:
             screen: name or file of a profile that it reads.
             picture: that it writes.
         """
-        profile = None if self._target is None else Output("--save", self._target, CAMERA, makes_folder=True)
-        drawn = None if picture is None else Output("--picture", picture, PICTURE)
+        profile = output("--save", self._target, CAMERA, makes_folder=True)
+        drawn = output("--picture", picture, PICTURE)
         claim([json_output(self._json_path, *json_keys), profile, drawn], read, (screen,), self._force)
 
     def write(
@@ -134,36 +135,30 @@ def _distortion(model: LensModel) -> tuple[str, str]:
 
 
 def _converted_report(
-    model: LensModel, worst_px: float, camera: str, name: str, at: str, source: str
+    found: LensfunModel | GyroflowProfile, camera: str, at: str, source: str
 ) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """The record and the lines of a lens model that was converted from another; `at` follows the lens's name."""
-    record = {"camera": camera, "lens": name, **_lens_record(model), "worst_px": worst_px}
-    return record, [
+    name, model = found.lens_name, found.lens
+    return {"camera": camera, "lens": name, **_lens_record(model), "worst_px": found.worst_px}, [
         ("camera", camera or "not named"),
         ("lens", f"{name or 'not named'}{at}"),
         ("focal", f"{model.camera_matrix[0][0]:.1f} px"),
         _distortion(model),
-        ("conversion", f"within {worst_px:.2f} px of {source}"),
+        ("conversion", f"within {found.worst_px:.2f} px of {source}"),
     ]
 
 
-class _BoardReader:
-    """Reads board pictures one by one; collects unreadable files and the first camera's metadata."""
-
-    def __init__(self, every: int) -> None:
-        self._every = every
-        self.unreadable: list[Rejected] = []
-        self.metadata: Metadata | None = None
-
-    def read(self, paths: list[Path]) -> Iterator[tuple[str, GrayImage]]:
-        """Name and grey picture of each board picture."""
-        for path in paths:
-            try:
-                for frame in islice(open_source(path), 0, None, self._every):
-                    self.metadata = self.metadata or frame.metadata
-                    yield (f"{path}#{frame.index}" if frame.index else str(path)), grey_levels(frame)
-            except InputError as error:
-                self.unreadable.append(Rejected(str(path), error.message.removeprefix(f"{path}: ")))
+def _board_pictures(
+    paths: list[Path], every: int, unreadable: list[Rejected], metadata: list[Metadata]
+) -> Iterator[tuple[str, GrayImage]]:
+    """Name and grey picture of each board picture; the lists get the unreadable files, and what all others state."""
+    for path in paths:
+        try:
+            for frame in islice(open_source(path), 0, None, every):
+                metadata.append(frame.metadata)
+                yield (f"{path}#{frame.index}" if frame.index else str(path)), grey_levels(frame)
+        except InputError as error:
+            unreadable.append(Rejected(str(path), error.message.removeprefix(f"{path}: ")))
 
 
 @calibrate.command(short_help="A lens, from pictures of a chessboard.")
@@ -187,9 +182,9 @@ def lens(paths: tuple[Path, ...], board_size: str, every: int, picture: Path | N
     columns, rows = _integers("--board", board_size, "[xX]", "9x6")
     board, files = Board(columns, rows, **given), _files(paths)
     wanted.claim(files, "rms_px", "camera_matrix", picture=picture)
-    reader = _BoardReader(every)
-    found, width, height = find_boards(reader.read(files), board)
-    result = calibrate_lens([*reader.unreadable, *found], width, height)
+    unreadable, metadata = list[Rejected](), list[Metadata]()
+    found, width, height = find_boards(_board_pictures(files, every, unreadable, metadata), board)
+    result = calibrate_lens([*unreadable, *found], width, height)
     if picture is not None:
         write_residuals(result, picture)
     (fx, _, cx), (_, fy, cy), _ = result.model.camera_matrix
@@ -210,8 +205,8 @@ def lens(paths: tuple[Path, ...], board_size: str, every: int, picture: Path | N
         "uncovered": result.uncovered,
         "intrinsic_sd_px": sd,
     }
-    lens_name = reader.metadata.lens if reader.metadata else None
-    wanted.write(record, lines, reader.metadata, lambda profile: with_lens(profile, result.model, lens_name))
+    camera = next(iter(metadata), Metadata())
+    wanted.write(record, lines, camera, lambda profile: with_lens(profile, result.model, camera.lens))
 
 
 @calibrate.command(short_help="Readout and line delay, from a blinking lamp.")
@@ -227,33 +222,22 @@ def lens(paths: tuple[Path, ...], board_size: str, every: int, picture: Path | N
     *_RESULTS,
 )
 @force_argument
-def shutter(
-    paths: tuple[Path, ...],
-    frequencies: tuple[float, ...],
-    screen: str | None,
-    axis: str,
-    region: str | None,
-    exposure_s: float | None,
-    frames: int,
-    mode: str | None,
-    **given: Any,
-) -> None:
+def shutter(paths: tuple[Path, ...], frequencies: tuple[float, ...], screen: str | None, **given: Any) -> None:
     """Line delay and readout from PATHS: pictures or clips, of one readout mode, of blinking lamps.
 
     Let the lamp fill much of the frame, out of focus, with an exposure well below half a period.
     """
-    if bool(frequencies) == bool(screen):
-        hint = "give the frequency of the lamp, as --frequency 1000"
-        raise UsageError("either --frequency or --screen is needed", hint)
+    lamp = "give the frequency of the lamp, as --frequency 1000"
+    refuse((bool(frequencies) == bool(screen), "either --frequency or --screen is needed", lamp))
+    axis, region, exposure_s = given["axis"], given["region"], given["exposure_s"]
     for value, option, limit in (*((f, "--frequency", 1e7) for f in frequencies), (exposure_s, "--exposure", 1)):
         if value is not None and not 0 < value < limit:
             raise UsageError(f"{option} must be above 0 and below {limit:g} (got {value:g})", "use hertz and seconds")
     window = None if region is None else _integers("--region", region, ",", "100,80,640,400")
-    if screen and window:
-        raise UsageError("--region goes with --frequency only", "leave it out")
+    refuse((screen and window, "--region goes with --frequency only", "leave it out"))
     wanted, files = _Results(given), _files(paths)
     wanted.claim(files, "readout_s", "line_delay_s", screen=screen)
-    chosen = _frames(files, frames)
+    chosen = _frames(files, given["frames"])
     raw = chosen[0].mosaic is not None  # its rows are the sensor's
     along: Any = "rows" if raw or (screen and axis == "auto") else None if axis == "auto" else axis
     if screen:
@@ -265,7 +249,8 @@ def shutter(
     for warning in (*result.warnings, *result.doubts):
         click.echo(f"vlc-rx: {warning}", err=True)
     record, lines = _shutter_report(result)
-    wanted.write(record, lines, chosen[0].metadata, lambda profile: _with_shutter(profile, result, mode), result.doubts)
+    name = given["mode"]
+    wanted.write(record, lines, chosen[0].metadata, lambda profile: _with_shutter(profile, result, name), result.doubts)
 
 
 def _frames(paths: list[Path], n: int) -> list[Frame]:
@@ -344,8 +329,7 @@ def lensfun(path: Path, **given: Any) -> None:
     metadata = replace(frame.metadata, **{key: value for key, value in given.items() if value})
     found = lens_from_database(metadata, frame.width, frame.height)
     at = f" at {metadata.focal_length_mm:g} mm"
-    names = (found.camera_name, found.lens_name, at, "lensfun's own")
-    record, lines = _converted_report(found.lens, found.worst_px, *names)
+    record, lines = _converted_report(found, found.camera_name, at, "lensfun's own")
     wanted.write(record, lines, metadata, lambda profile: with_lens(profile, found.lens, metadata.lens))
 
 
@@ -380,7 +364,7 @@ def gyroflow(path: Path, size: str | None, photo: Path | None, screen: str | Non
         return with_mode(profile, _mode(measured)) if measured else profile
 
     camera, at = f"{found.make} {found.model}".strip(), f", {found.lens.width} x {found.lens.height}"
-    record, lines = _converted_report(found.lens, found.worst_px, camera, found.lens_name, at, "the fisheye model")
+    record, lines = _converted_report(found, camera, at, "the fisheye model")
     record |= {"readout_told_s": found.readout_s, "reversed": found.reversed, "notes": notes}
     record["readout_measured_s"] = measured.readout_s if measured else None
     lines += [("readout", warning) for warning in notes]

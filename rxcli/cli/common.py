@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -110,11 +111,18 @@ def refuse(*rules: tuple[object, str, str]) -> None:
             raise UsageError(reason, step)
 
 
+def output(option: str, path: Any, ours: re.Pattern[bytes], **more: Any) -> Output | None:
+    """The file that an option names; None where the option was not given, or means stdout. See `Output`."""
+    from rxcli.outputs import Output
+
+    return None if path is None or str(path) == "-" else Output(option, Path(path), ours, **more)
+
+
 def json_output(path: str | None, *keys: str) -> Output | None:
     """The file of a command's --json, or None; earlier outputs are recognised by their `keys`."""
-    from rxcli.outputs import Output, json_with
+    from rxcli.outputs import json_with
 
-    return None if path in (None, "-") else Output("--json", Path(str(path)), json_with(*keys))
+    return output("--json", path, json_with(*keys))
 
 
 def write_json(value: Any, path: str) -> None:

@@ -83,8 +83,6 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
     written += [Output("--truth", options["truth"], TRUTH)] if options["truth"] else []
     claim(written, filter(None, files), (options["screen"],), options["force"])
     plan = _plan(path, screen, options)
-    for row in plan.weights:
-        plan.sending.check(row, screen.payload_symbols)
     try:
         if has_slots:
             _write_slots(plan, out, suffix)
@@ -101,19 +99,18 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
 
 def _plan(path: Path | None, screen: ScreenProfile, options: dict[str, Any]) -> _Plan:
     given = (path, options["text"], options["uri"])
-    sending: Sending | TestLight
     if options["payload"] is None:
         sending = sending_of(*given, _RATES[options["mother"]], options["object_id"])
         n_bursts = _n_bursts(options, sending, screen)
         weights = _weights(options["weights"], n_bursts, screen.columns)
-    else:
-        refuse(
-            (any(value is not None for value in given), "--payload excludes PATH, --text and --uri", "give one of them")
-        )
-        weights = _weights(options["weights"], 1, screen.columns)
-        sending = raw_sending(options["payload"], weights[0], options["seed"], options["same"])
-        n_bursts = _n_bursts(options, sending, screen)
-    return _Plan(sending, screen, weights, n_bursts, options["only_column"])
+        for row in weights:
+            sending.check(row, screen.payload_symbols)
+        return _Plan(sending, screen, weights, n_bursts, options["only_column"])
+    is_both = any(value is not None for value in given)
+    refuse((is_both, "--payload excludes PATH, --text and --uri", "give one of them"))
+    weights = _weights(options["weights"], 1, screen.columns)
+    raw = raw_sending(options["payload"], weights[0], options["seed"], options["same"])
+    return _Plan(raw, screen, weights, _n_bursts(options, raw, screen), options["only_column"])
 
 
 def _write_slots(plan: _Plan, out: Path, suffix: str) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import product
+from itertools import chain, product
 from operator import itemgetter
 from typing import TypeVar
 
@@ -78,31 +78,21 @@ class _Round:
         self.levels = _levels(self.total)
 
 
-@dataclass(frozen=True, slots=True)
 class _FrameSum:
     """The bursts of a frame, added up by their number modulo P."""
 
-    #: (S,) distinct positions, and (S, N, C, 7) sums.
-    slots: NDArray[np.int64]
-    total: Float32
-    #: Sum of `surprise` of every ratio.
-    alone: float
-
-    def similarity(self) -> float:
-        """Log-likelihood ratio of bursts at the same position being equal."""
-        return float(_levels(self.total).sum()) - self.alone
+    def __init__(self, soft: FrameSoftBits, period: int) -> None:
+        #: (S,) distinct positions, and (S, N, C, 7) sums.
+        self.slots, place = np.unique(soft.burst % period, return_inverse=True)
+        self.total = np.zeros((self.slots.size, *soft.llr.shape[1:]), np.float32)
+        np.add.at(self.total, place, soft.llr)
+        #: Sum of `surprise` of every ratio; and log-likelihood ratio of bursts at the same position being equal.
+        self.alone = float(surprise(soft.llr).sum(dtype=np.float64))
+        self.similarity = float(_levels(self.total).sum()) - self.alone
 
 
 def _levels(total: Float32) -> NDArray[np.float64]:
     return np.asarray(surprise(total).sum(axis=(1, 2, 3), dtype=np.float64))
-
-
-def _frame_sum(soft: FrameSoftBits, period: int) -> _FrameSum:
-    slots, place = np.unique(soft.burst % period, return_inverse=True)
-    total = np.zeros((slots.size, *soft.llr.shape[1:]), np.float32)
-    for burst, slot in enumerate(place):
-        total[slot] += soft.llr[burst]
-    return _FrameSum(slots, total, float(surprise(soft.llr).sum(dtype=np.float64)))
 
 
 class BeaconSearch:
@@ -143,37 +133,27 @@ class BeaconSearch:
 
     def _joined(self, period: int, soft: FrameSoftBits, settled: Placement | None) -> _Round | None:
         """Add the bursts to their round or to a new one; None if they contradict each other."""
-        frame = _frame_sum(soft, period)
-        if frame.similarity() < MIN_SIMILARITY:
+        frame, rounds, as_numbered = _FrameSum(soft, period), self._rounds[period], settled or Placement()
+        if frame.similarity < MIN_SIMILARITY:
             return None
-        rounds, as_numbered = self._rounds[period], settled or Placement()
-        choices = [
-            (known.gain(frame, phase, placement), place, phase, placement)
-            for place, known in enumerate(rounds)
-            for phase, placement in (
-                ((known.phase, known.placement),)
-                if known.epoch == soft.epoch
-                else product(range(period), (as_numbered,))
-            )
-        ]
+
+        def scored(places: Iterable[tuple[_Round, int, Placement]]) -> list[tuple[float, _Round, int, Placement]]:
+            return [(known.gain(frame, phase, at), known, phase, at) for known, phase, at in places]
+
+        earlier = [known for known in rounds if known.epoch != soft.epoch]
+        choices = scored((known, known.phase, known.placement) for known in rounds if known.epoch == soft.epoch)
+        choices += scored(product(earlier, range(period), (as_numbered,)))
         if max((gain for gain, *_ in choices), default=np.inf) < _COPIES and settled is None:
             # Photographs may be numbered otherwise; that they carry the same message must then be certain.
-            elsewhere = [placement for group in possible_placements(frame.total)[1:] for placement in group]
+            others = product(earlier, range(period), chain(*possible_placements(frame.total)[1:]))
             choices += [
-                (known.gain(frame, phase, placement) + MIN_SIMILARITY - _COPIES, place, phase, placement)
-                for place, known in enumerate(rounds)
-                if known.epoch != soft.epoch
-                for phase, placement in product(range(period), elsewhere)
+                (gain + MIN_SIMILARITY - _COPIES, known, phase, at) for gain, known, phase, at in scored(others)
             ]
-        gain, place, phase, placement = max(choices, key=itemgetter(0), default=(-np.inf, 0, 0, as_numbered))
-        if gain > MIN_SIMILARITY:
-            candidate = rounds.pop(place)
-        else:
-            blank = np.zeros((period, *self._shape), np.float32)
-            candidate, phase, placement = _Round(blank, np.zeros(period), 0.0, soft.epoch), 0, as_numbered
+        blank = _Round(np.zeros((period, *self._shape), np.float32), np.zeros(period), 0.0, soft.epoch)
+        choices.insert(0, (MIN_SIMILARITY, blank, 0, as_numbered))
+        _, candidate, phase, placement = max(choices, key=itemgetter(0))
         candidate.add(frame, phase, placement, soft.epoch)
-        rounds.append(candidate)
-        del rounds[:-_MAX_ROUNDS]
+        self._rounds[period] = [*(known for known in rounds if known is not candidate), candidate][-_MAX_ROUNDS:]
         return candidate
 
     def _try(self, candidate: _Round, settled: Placement | None) -> None:

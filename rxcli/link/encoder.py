@@ -2,6 +2,7 @@
 
 import zlib
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from rxcli.link import ldpc
 from rxcli.link.formats import Announcement, beacon_body, pack_container, protect_beacon, protect_block
 from rxcli.link.layout import (
     ANNOUNCEMENT_PERIOD,
+    BLOCK_BYTES,
     LABEL_BITS,
     READY,
     BeaconLayout,
@@ -19,7 +21,7 @@ from rxcli.link.layout import (
     announcement_layout,
     beacon_layout,
 )
-from rxcli.protocol import HEADER, bits_per_symbol, bits_to_hex, codebook, dimming_symbol
+from rxcli.protocol import HEADER, bits_per_symbol, bits_to_hex, bits_to_indices, codebook, dimming_symbol
 from rxcli.types import MessageKind
 
 #: Information at which one photo suffices for a beacon, relative to its bits.
@@ -39,8 +41,10 @@ def _bits(data: bytes) -> NDArray[np.uint8]:
     return np.unpackbits(np.frombuffer(data, np.uint8))
 
 
-def _labels(buffer: NDArray[np.uint8], places: Places) -> Labels:
-    return np.asarray(buffer[places] @ _LABEL_WEIGHTS, np.uint8)
+def _labels(layout: BeaconLayout, protected: bytes, bursts: Places) -> Labels:
+    """(n, N, C) uint8 labels of bursts `bursts` (n,) of a beacon or an announcement."""
+    buffer = ldpc.encode(layout.code, _bits(protected)[None])[0]
+    return np.asarray(buffer[layout.places[bursts % layout.period]] @ _LABEL_WEIGHTS, np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +56,7 @@ class MessageSending:
 
     def labels(self, bursts: Places, columns: int, payload_symbols: int) -> Labels:
         """(n, N, C) uint8 labels of bursts `bursts` (n,)."""
-        layout = beacon_layout(len(self.body), columns, payload_symbols)
-        return _labels(self._buffer(layout), layout.places[bursts % layout.period])
+        return _labels(beacon_layout(len(self.body), columns, payload_symbols), protect_beacon(self.body), bursts)
 
     def check(self, weights: NDArray[np.int64], payload_symbols: int) -> None:
         """Refuse a message that a round of bursts cannot carry with these weights (C,).
@@ -72,10 +75,6 @@ class MessageSending:
     def usual_bursts(self, columns: int, payload_symbols: int) -> int:
         """Bursts of a round, after which the message repeats."""
         return beacon_layout(len(self.body), columns, payload_symbols).period
-
-    def _buffer(self, layout: BeaconLayout) -> NDArray[np.uint8]:
-        buffer: NDArray[np.uint8] = ldpc.encode(layout.code, _bits(protect_beacon(self.body))[None])[0]
-        return buffer
 
     @property
     def summary(self) -> str:
@@ -112,7 +111,6 @@ class FileSending:
             raise UsageError(f"{name} has {len(container)} bytes; a file must stay below 4 GiB", "send parts of it")
         self.container, self.object_id, self.mother, self.name = container, object_id, mother, name
         self._crc = zlib.crc32(container)
-        self._coded: NDArray[np.uint8] | None = None
 
     def layout(self, columns: int, payload_symbols: int) -> FileLayout:
         """Layout of the bits on a screen."""
@@ -124,10 +122,14 @@ class FileSending:
         out = np.empty((len(bursts), payload_symbols, columns), np.uint8)
         announcing = bursts % ANNOUNCEMENT_PERIOD == 0
         for place in np.flatnonzero(announcing):
-            out[place] = self._announcement(int(bursts[place]), columns, payload_symbols)
+            burst = int(bursts[place])
+            announcement = Announcement(self.mother, self.object_id, len(self.container), burst, self._crc)
+            out[place] = _labels(
+                announcement_layout(columns, payload_symbols), announcement.protected(), np.zeros(1, int)
+            )
         if not announcing.all():
             blocks, bits = layout.places(bursts[~announcing])
-            packed = self._buffers(layout)[blocks[..., None], bits >> 3]
+            packed = self._coded[blocks[..., None], bits >> 3]
             out[~announcing] = ((packed >> (7 - (bits & 7)).astype(np.uint8)) & 1) @ _LABEL_WEIGHTS
         return out
 
@@ -159,21 +161,15 @@ class FileSending:
         layout = self.layout(1, 1)
         return READY[self.mother] * layout.code.k * layout.n_blocks
 
-    def _announcement(self, burst: int, columns: int, payload_symbols: int) -> Labels:
-        layout = announcement_layout(columns, payload_symbols)
-        announcement = Announcement(self.mother, self.object_id, len(self.container), burst, self._crc)
-        return _labels(ldpc.encode(layout.code, _bits(announcement.protected())[None])[0], layout.places[0])
-
-    def _buffers(self, layout: FileLayout) -> NDArray[np.uint8]:
+    @cached_property
+    def _coded(self) -> NDArray[np.uint8]:
         """(B, bytes) every block's coded bits, packed."""
-        if self._coded is None:
-            size = layout.block_bytes
-            pieces = [self.container[i : i + size].ljust(size, b"\0") for i in range(0, len(self.container), size)]
-            blocks = [protect_block(piece, self.object_id, number) for number, piece in enumerate(pieces)]
-            batches = (blocks[i : i + _BATCH] for i in range(0, len(blocks), _BATCH))
-            coded = (ldpc.encode(layout.code, np.stack([*map(_bits, batch)]))[:, : layout.n_bits] for batch in batches)
-            self._coded = np.concatenate([np.packbits(bits, axis=1) for bits in coded])
-        return self._coded
+        layout, size = self.layout(1, 1), min(len(self.container), BLOCK_BYTES)
+        pieces = [self.container[i : i + size].ljust(size, b"\0") for i in range(0, len(self.container), size)]
+        bits = [_bits(protect_block(piece, self.object_id, number)) for number, piece in enumerate(pieces)]
+        batches = (np.stack(bits[i : i + _BATCH]) for i in range(0, len(bits), _BATCH))
+        coded = (ldpc.encode(layout.code, batch)[:, : layout.n_bits] for batch in batches)
+        return np.concatenate([np.packbits(batch, axis=1) for batch in coded])
 
     @property
     def summary(self) -> str:
@@ -203,15 +199,14 @@ class RawSending:
         out = np.empty((len(bursts), payload_symbols, columns), np.uint8)
         for place, burst in enumerate(bursts.tolist()):
             for column, bits in enumerate(self._payload(burst, payload_symbols)):
-                symbols = np.zeros((payload_symbols, LABEL_BITS), np.uint8)
-                symbols[:, : bits.size // payload_symbols] = bits.reshape(payload_symbols, -1)
-                out[place, :, column] = symbols @ _LABEL_WEIGHTS
+                w = int(self.weights[column])
+                out[place, :, column] = bits_to_indices(bits, w) << (LABEL_BITS - bits_per_symbol(w))
         return out
 
     def _payload(self, burst: int, payload_symbols: int) -> list[NDArray[np.uint8]]:
         """Payload bits of a burst, by column."""
         sizes = [payload_symbols * bits_per_symbol(int(w)) for w in self.weights]
-        total = max(sizes) if self.same else sum(sizes)
+        total = self._burst_bits(payload_symbols)
         if self.content is not None:
             bits = np.take(_bits(self.content), np.arange(burst * total, (burst + 1) * total), mode="wrap")
         elif self.seed is not None:
@@ -222,15 +217,16 @@ class RawSending:
             return [np.resize(number, size) for size in sizes]
         return [bits[:size] for size in sizes] if self.same else np.split(bits, np.cumsum(sizes)[:-1])
 
-    def check(self, weights: NDArray[np.int64], payload_symbols: int) -> None:
-        """Raw payload may have any weights."""
+    def _burst_bits(self, payload_symbols: int) -> int:
+        """Different bits of a burst."""
+        bits = [payload_symbols * bits_per_symbol(int(w)) for w in self.weights]
+        return max(bits) if self.same else sum(bits)
 
     def usual_bursts(self, columns: int, payload_symbols: int) -> int:
         """Bursts after which the payload begins anew; of random bits and a counter some."""
         if self.content is None:
             return _RAW_BURSTS
-        sizes = [payload_symbols * bits_per_symbol(int(w)) for w in self.weights]
-        return -(-8 * len(self.content) // (max(sizes) if self.same else sum(sizes)))
+        return -(-8 * len(self.content) // self._burst_bits(payload_symbols))
 
     @property
     def summary(self) -> str:
@@ -244,9 +240,6 @@ class TestLight:
     """Light without packets: of every four slots some lit ones, then dark ones."""
 
     n_lit: int
-
-    def check(self, weights: NDArray[np.int64], payload_symbols: int) -> None:
-        """Light needs no bits."""
 
     def usual_bursts(self, columns: int, payload_symbols: int) -> int:
         """Two, which have a multiple of four slots on any screen."""

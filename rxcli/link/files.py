@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
@@ -239,7 +239,8 @@ class FileSearch:
         self._under_way = under_way
         self._columns, self._payload_symbols = columns, payload_symbols
         self._layout = announcement_layout(columns, payload_symbols)
-        self.files: dict[tuple[int, int, int, int], FileState] = {}
+        #: By what is equal in all announcements of a file: they differ in their burst.
+        self.files: dict[Announcement, FileState] = {}
         #: Latest timeline of every epoch.
         self._timelines: dict[int, _Timeline] = {}
         #: Bursts that no announcement has settled yet: what follows the last one of a file may be of the next file.
@@ -261,9 +262,6 @@ class FileSearch:
             self._n_shifted += len(groups) > 2
             for placement in chain(*groups):
                 self._look_for_announcement(soft.epoch, int(number), placement, placement.of(llr))
-        # These have too few copies to decide. A batch costs little more than a single attempt.
-        if len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
-            self._try_gathered()
         bursts = [
             _Burst(soft.epoch, *burst) for burst in zip(soft.burst.tolist(), ldpc.quantised(soft.llr), strict=True)
         ]
@@ -280,7 +278,7 @@ class FileSearch:
 
     def finish(self) -> list[tuple[FileState, Container]]:
         """Decode the remaining announcements and blocks."""
-        self._try_gathered()
+        self._try_candidates()
         return self._complete(at_last=True)
 
     # -- announcements -------------------------------------------------------------------------------------------------
@@ -290,18 +288,17 @@ class FileSearch:
         similarity = same_bits_llr(buffer, float(surprise(llr).sum(dtype=np.float64)))
         if similarity < MIN_SIMILARITY or information(buffer).sum() < TRY_FROM * self._layout.code.k:
             return
-        candidate = _Candidate(epoch, number, placement, buffer)
-        if similarity > -MIN_SIMILARITY:
-            self._try_candidates([candidate])
-        elif epoch not in self._timelines:
-            self._candidates.append(candidate)
+        is_similar = similarity > -MIN_SIMILARITY
+        if is_similar or epoch not in self._timelines:
+            self._candidates.append(_Candidate(epoch, number, placement, buffer))
+        # Others have too few copies to decide. A batch costs little more than a single attempt.
+        if is_similar or len(self._candidates) >= _ANNOUNCEMENTS_AT_ONCE:
+            self._try_candidates()
 
-    def _try_gathered(self) -> None:
+    def _try_candidates(self) -> None:
         candidates, self._candidates = self._candidates, []
-        if candidates:
-            self._try_candidates(candidates)
-
-    def _try_candidates(self, candidates: list[_Candidate]) -> None:
+        if not candidates:
+            return
         buffers = np.stack([candidate.buffer for candidate in candidates])
         found = read_words(self._layout.code, buffers, lambda _, word: unprotect_announcement(word))
         for candidate, announcement in zip(candidates, found, strict=True):
@@ -309,7 +306,7 @@ class FileSearch:
                 self._announced(announcement, candidate)
 
     def _announced(self, announcement: Announcement, candidate: _Candidate) -> None:
-        known = self.files.get(announcement.key)
+        known = self.files.get(replace(announcement, burst=0))
         if known is None or known.dropped:
             known = self._begun(announcement)
             if known is None:
@@ -344,7 +341,7 @@ class FileSearch:
             )
             return None
         self.files = {key: known for key, known in self.files.items() if not known.dropped}
-        self.files[announcement.key] = file
+        self.files[replace(announcement, burst=0)] = file
         return file
 
     def _add_note(self, sentence: str) -> None:

@@ -114,11 +114,6 @@ class Announcement:
         body = _ANNOUNCEMENT.pack(_VERSION, self.mother, self.object_id, self.length, self.burst, self.container_crc, 0)
         return protect(body, ANNOUNCEMENT_ID, len(body))
 
-    @property
-    def key(self) -> tuple[int, int, int, int]:
-        """Fields that are equal in all announcements of one object."""
-        return self.object_id, self.length, self.mother, self.container_crc
-
 
 def unprotect_announcement(coded: bytes) -> Announcement | None:
     """The announcement, or None if the information is none or inconsistent."""

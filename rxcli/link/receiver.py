@@ -78,17 +78,9 @@ class LinkReceiver:
 
     @staticmethod
     def _object(soft: FrameSoftBits, file: FileState, found: Container) -> ReceivedObject:
-        return ReceivedObject(
-            name=found.name,
-            data=found.data,
-            size=len(found.data),
-            sha256=found.sha256,
-            object_id=file.layout.object_id,
-            n_blocks=file.layout.n_blocks,
-            source=soft.source,
-            frame=soft.frame,
-            time_s=soft.time_s,
-        )
+        layout, data = file.layout, found.data
+        seen = (soft.source, soft.frame, soft.time_s)
+        return ReceivedObject(found.name, data, len(data), found.sha256, layout.object_id, layout.n_blocks, *seen)
 
     @property
     def progress(self) -> list[ObjectProgress]:
