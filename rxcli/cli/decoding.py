@@ -4,7 +4,7 @@ import json
 import logging
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +12,8 @@ from tempfile import NamedTemporaryFile
 from typing import Any
 
 from rxcli import __version__, outputs
-from rxcli.cli.common import receiver_options, refuse
-from rxcli.cli.printing import JsonLines, PayloadTable, Progress, Table, Writer, print_line, print_text
+from rxcli.cli.common import output, receiver_options, refuse
+from rxcli.cli.printing import JsonLines, Progress, Table, Writer, print_line, print_text
 from rxcli.errors import ExitCode, InputError, ReceiverError, worst
 from rxcli.ingest import KNOWN_SUFFIXES, MAX_BYTES, open_source
 from rxcli.link.collector import PhotoCollector
@@ -23,20 +23,25 @@ from rxcli.profiles import dump_profile
 from rxcli.results import report, summary
 from rxcli.results.baseline import load_baseline
 from rxcli.results.cameras import estimated_camera
+from rxcli.results.columns import PAYLOAD_TABLE
 from rxcli.results.truth import Scorer, load_truth, truth_for
 from rxcli.runs import batch
 from rxcli.runs.journal import Head, Journal, Lines
 from rxcli.types import BELIEVABLE, FrameResult
 
 log = logging.getLogger(__name__)
-#: Options that change nothing of a source's results: where they go, who decodes, what is asked of them.
-_NO_MATTER = frozenset(
-    {
-        *("json_path", "junit", "summary", "save_camera", "dump_dir", "save_undistorted", "quiet", "force", "resume"),
-        *("workers", "cluster", "max_ber", "min_packets", "min_packet_confidence"),
-        *("baseline", "slower", "out", "payloads", "packets"),
-    }
+#: Options on which a source's results depend.
+_MATTERS: tuple[str, ...] = (
+    "screens",
+    "cameras",
+    "corners",
+    "mirrored",
+    "cae",
+    "min_confidence",
+    "no_skip",
+    "file_memory_mb",
 )
+_MATTERS += ("truth", "same_camera", "stop_when_certain")
 #: The source that is read from stdin.
 STDIN = "-"
 #: Bytes that are read of it at a time.
@@ -99,40 +104,37 @@ def _check(paths: tuple[str, ...], given: dict[str, Any], n_sources: int) -> Non
         summary.check_summary_path(given["summary"])
 
 
-def _flag(name: str) -> str:
-    return "--" + name.removesuffix("_path").replace("_", "-")
-
-
 def _claim(given: dict[str, Any], sources: list[batch.Source]) -> outputs.Taken:
     """Refuse outputs that would destroy something, and make the folders of the taps; returns the files of the run."""
     truths = [truth_for(source.name, given["truth"]) for source in sources]
     inputs = [source.path for source in sources] + [str(path) for path in truths if path is not None]
     taken = outputs.claim(_outputs(given), inputs, (*given["screens"], *given["cameras"]), given["force"])
     out = given["out"]
-    for name in ("dump_dir", "save_undistorted", "out"):
-        if given[name] is not None:
-            outputs.claim_folder(_flag(name), given[name])
-            is_inside = out is not None and name != "out" and out.resolve().is_relative_to(given[name].resolve())
-            refuse((is_inside, f"--out {out}: {_flag(name)} writes there", "name a folder for received files alone"))
+    for option, folder in (("--dump-dir", given["dump_dir"]), ("--save-undistorted", given["save_undistorted"])):
+        if folder is not None:
+            outputs.claim_folder(option, folder)
+            is_inside = out is not None and out.resolve().is_relative_to(folder.resolve())
+            refuse((is_inside, f"--out {out}: {option} writes there", "name a folder for received files alone"))
+    if out is not None:
+        outputs.claim_folder("--out", out)
     return taken
 
 
-def _outputs(given: dict[str, Any]) -> Iterator[outputs.Output]:
+def _outputs(given: dict[str, Any]) -> list[outputs.Output | None]:
     """Every file that the run will write."""
-    is_table = given["summary"] is not None and given["summary"].suffix.casefold() == ".csv"
-    for name, ours in {
-        # Resuming looks closer, and knows half lines.
-        "json_path": outputs.ANYTHING if given["resume"] else outputs.JOURNAL,
-        "junit": outputs.JUNIT,
-        "summary": outputs.CSV_SUMMARY if is_table else outputs.PARQUET_SUMMARY,
-        "save_camera": outputs.ESTIMATED_CAMERA,
-        "payloads": outputs.PAYLOADS,
-    }.items():
-        if given[name] not in (None, "-"):
-            way_on = None
-            if name == "json_path" and not given["resume"]:
-                way_on = "go on with it by --resume, replace it with --force, or name another file"
-            yield outputs.Output(_flag(name), Path(given[name]), ours, way_on=way_on)
+    table = outputs.PARQUET_SUMMARY
+    if given["summary"] is not None and given["summary"].suffix.casefold() == ".csv":
+        table = outputs.CSV_SUMMARY
+    way_on = "go on with it by --resume, replace it with --force, or name another file"
+    # Resuming looks closer, and knows half lines.
+    ours = (outputs.ANYTHING, None) if given["resume"] else (outputs.JOURNAL, way_on)
+    return [
+        output("--json", given["json_path"], ours[0], way_on=ours[1]),
+        output("--junit", given["junit"], outputs.JUNIT),
+        output("--summary", given["summary"], table),
+        output("--save-camera", given["save_camera"], outputs.ESTIMATED_CAMERA),
+        output("--payloads", given["payloads"], outputs.PAYLOADS),
+    ]
 
 
 @contextmanager
@@ -175,7 +177,8 @@ class _Run:
         self._estimated: FrameResult | None = None
         #: Name of a source -> where it is opened.
         self._paths = {source.name: source.path for source in sources}
-        self._output, self._payloads = Writer(), Writer()
+        self._output = Writer()
+        self._put_payloads: Callable[[Iterable[Iterable[Any]]], None] | None = None
 
     def run(self) -> ExitCode:
         """Decode what is not done yet, and write what is asked for; returns the exit code."""
@@ -187,7 +190,9 @@ class _Run:
 
             output = None if path in (None, "-") else journal(path, resume)
             if self._given["payloads"] is not None:
-                self._payloads = PayloadTable(journal(self._given["payloads"]).append)
+                append = journal(self._given["payloads"]).append
+                self._put_payloads = lambda rows: append(report.csv_text(rows).removesuffix("\n"))
+                self._put_payloads([PAYLOAD_TABLE])
             if path is not None:
                 lines = Lines(self._head(), {name: path for name, path in self._paths.items() if name != STDIN})
                 if output is not None and resume:
@@ -215,7 +220,7 @@ class _Run:
 
         from rxcli.runs.provenance import settings_in_force
 
-        given = {name: value for name, value in self._given.items() if name not in _NO_MATTER}
+        given = {name: value for name, value in self._given.items() if name in _MATTERS}
         configured = self._decoder.options
         profiles = msgspec.json.encode((configured.screens, configured.cameras))
         mark = {"profiles": hashlib.sha256(profiles).hexdigest()[:16], "settings": settings_in_force()}
@@ -284,11 +289,12 @@ class _Run:
     def _count(self, result: FrameResult, counted: summary.SourceSummary) -> None:
         counted.add(result)
         self._baseline.add(result)
-        self._payloads.write(result, last=False)
+        if self._put_payloads is not None and result.packets:
+            self._put_payloads(report.payload_rows(result))
 
     def _keep_estimate(self, result: FrameResult) -> None:
-        most = len(self._estimated.packets) if self._estimated else 0
         # An estimate that received nothing may be wrong, and a profile is not doubted.
+        most = len(self._estimated.packets) if self._estimated else 0
         if "line_delay_s" in result.estimated and len(result.packets) > most:
             self._estimated = result
 

@@ -5,14 +5,13 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Self, TextIO, TypeVar
 
 import click
 
 from rxcli.results import report
-from rxcli.results.columns import PAYLOAD_TABLE
 from rxcli.results.summary import SourceSummary, format_clip
 from rxcli.runs.journal import Lines
 from rxcli.types import FrameResult
@@ -92,22 +91,6 @@ class JsonLines(Writer):
     def write(self, result: FrameResult, last: bool) -> None:
         """Write the frame's object."""
         self._put(self._lines.line(result, last))
-
-
-class PayloadTable(Writer):
-    """One row of CSV a packet, given to `put`."""
-
-    def __init__(self, put: Callable[[str], None]) -> None:
-        self._put = put
-        self._write([PAYLOAD_TABLE])
-
-    def write(self, result: FrameResult, last: bool) -> None:
-        """Write the packets of the frame."""
-        if result.packets:
-            self._write(report.payload_rows(result))
-
-    def _write(self, rows: Iterable[Iterable[Any]]) -> None:
-        self._put(report.csv_text(rows).removesuffix("\n"))
 
 
 def print_line(line: str) -> None:
