@@ -26,12 +26,7 @@ _COUNTED = ("--count", _COUNT, None, "Numbers to draw at each point.  [default: 
 _CAPTURES = ("--folder captures", _FOLDER, None, "Of `captures` and `files`: where they lie.  [default: the samples]")
 _ONLY = ("--only", [str], None, "A point of the scenario; may be given several times.")
 _QUIET = ("--quiet", None, False, "No progress bar.")
-_RUN = (
-    ("--jobs", click.IntRange(1, 256), 1, "Processes, one thread each."),
-    _OUT,
-    _SEED,
-    _QUIET,
-)
+_RUN = (("--jobs", click.IntRange(1, 256), 1, "Processes, one thread each."), _OUT, _SEED, _QUIET)
 
 
 class _Scenarios(SuggestingGroup):

@@ -77,7 +77,7 @@ receiver_arguments = options(
 )
 #: For every command that writes files which may be somebody's.
 force_argument = options(
-    ("--force", None, False, "Replace files that are there already and were not written by the same option."),
+    ("--force", None, False, "Replace files that are there already and were not written by the same option.")
 )
 
 

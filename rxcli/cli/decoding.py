@@ -31,17 +31,8 @@ from rxcli.types import BELIEVABLE, FrameResult
 
 log = logging.getLogger(__name__)
 #: Options on which a source's results depend.
-_MATTERS: tuple[str, ...] = (
-    "screens",
-    "cameras",
-    "corners",
-    "mirrored",
-    "cae",
-    "min_confidence",
-    "no_skip",
-    "file_memory_mb",
-)
-_MATTERS += ("truth", "same_camera", "stop_when_certain")
+_MATTERS = {"screens", "cameras", "corners", "mirrored", "cae", "min_confidence", "no_skip", "file_memory_mb"}
+_MATTERS |= {"truth", "same_camera", "stop_when_certain"}
 #: The source that is read from stdin.
 STDIN = "-"
 #: Bytes that are read of it at a time.

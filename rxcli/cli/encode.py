@@ -14,21 +14,13 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.cli.common import force_argument, options, refuse
+from rxcli.cli.common import force_argument, options, output, refuse
 from rxcli.cli.kinds import FILE, POSITIVE
 from rxcli.cli.sending import LIGHT, raw_sending, sending_of
 from rxcli.errors import InputError, UsageError
-from rxcli.link.encoder import (
-    TEST_LIGHT_SLOTS,
-    FileSending,
-    Sending,
-    TestLight,
-    packet_slots_of,
-    payload_hex,
-    visible_bits_of_burst,
-)
+from rxcli.link.encoder import FileSending, Sending, TestLight, packet_slots_of, payload_hex, visible_bits_of_burst
 from rxcli.link.slots import WITHOUT_TEXT, WRITERS, bytes_per_row, order_of, write_slots
-from rxcli.outputs import ENCODED, TRUTH, Output, claim, unwritable, write_whole
+from rxcli.outputs import ENCODED, TRUTH, claim, unwritable, write_whole
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import payload_bits
 from rxcli.results.report import plural
@@ -64,8 +56,7 @@ _OUT_HELP = "Where to write: .npy or .csv; slots also as .bin, .h or .vcd; - for
 def encode(path: Path | None, out: Path, **options: Any) -> None:
     """Encode the file PATH, a text, a URI or raw payload as labels, or slots, for a transmitter."""
     screen, payload, only = load_profile(options["screen"], ScreenProfile), options["payload"], options["only_column"]
-    is_stream = str(out) == "-"
-    suffix = ".csv" if is_stream else out.suffix
+    suffix = ".csv" if str(out) == "-" else out.suffix
     has_slots = options["slots"] or payload is not None or suffix not in (".npy", ".csv")
     is_ambiguous = options["bursts"] is not None and options["seconds"] is not None
     known, n = ", ".join(WRITERS), screen.columns
@@ -78,9 +69,9 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
         (options["truth"] and payload in LIGHT, f"--payload {payload} sends no packets", "leave out --truth"),
     )
     files = [path, *(Path(name) for name in (options["weights"], payload) if name and Path(name).is_file())]
-    readme = Output("--slots", _readme_of(out), ENCODED) if has_slots and suffix in WITHOUT_TEXT else None
-    written = [None if is_stream else Output("--out", out, ENCODED), readme]
-    written += [Output("--truth", options["truth"], TRUTH)] if options["truth"] else []
+    readme = _readme_of(out) if has_slots and suffix in WITHOUT_TEXT else None
+    written = [output("--out", out, ENCODED), output("--slots", readme, ENCODED)]
+    written.append(output("--truth", options["truth"], TRUTH))
     claim(written, filter(None, files), (options["screen"],), options["force"])
     plan = _plan(path, screen, options)
     try:
@@ -119,11 +110,8 @@ def _write_slots(plan: _Plan, out: Path, suffix: str) -> None:
     with click.open_file(str(out), "wb") as file:
         write_slots(file, suffix, plan.slots(), n_slots, screen)
     if suffix in WITHOUT_TEXT:
-        about = (
-            f"{out.name}: uint8 ({n_slots}, {bytes_per_row(screen)}); {order_of(screen)}; column 0 is the most "
-            "significant bit of the first byte.\n"
-        )
-        _readme_of(out).write_text(about, encoding="utf-8")
+        shape, bits = (n_slots, bytes_per_row(screen)), "column 0 is the most significant bit of the first byte"
+        _readme_of(out).write_text(f"{out.name}: uint8 {shape}; {order_of(screen)}; {bits}.\n", encoding="utf-8")
 
 
 def _readme_of(out: Path) -> Path:
@@ -131,11 +119,10 @@ def _readme_of(out: Path) -> Path:
 
 
 def _n_bursts(options: dict[str, Any], sending: Sending | TestLight, screen: ScreenProfile) -> int:
-    burst_s = screen.packet_s * screen.repeats
     if options["bursts"] is not None:
         return int(options["bursts"])
     if options["seconds"] is not None:
-        return max(1, ceil(float(options["seconds"]) / burst_s))
+        return max(1, ceil(float(options["seconds"]) / (screen.packet_s * screen.repeats)))
     return sending.usual_bursts(screen.columns, screen.payload_symbols)
 
 
@@ -182,39 +169,36 @@ class _Plan:
     def burst_slots(self) -> int:
         return self.screen.packet_slots * self.screen.repeats
 
-    def _chunks(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """First burst and labels (bursts, symbols, columns) of some bursts at a time."""
+    def _chunks(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.uint8]]]:
+        """Numbers and labels (bursts, symbols, columns) of some bursts at a time."""
         assert not isinstance(self.sending, TestLight)
-        for start in range(0, self.n_bursts, _CHUNK):
-            bursts = np.arange(start, min(start + _CHUNK, self.n_bursts))
-            yield start, self.sending.labels(bursts, self.screen.columns, self.screen.payload_symbols)
+        for bursts in np.split(np.arange(self.n_bursts), range(_CHUNK, self.n_bursts, _CHUNK)):
+            yield bursts, self.sending.labels(bursts, self.screen.columns, self.screen.payload_symbols)
 
     def write_labels(self, out: Path) -> None:
         """Write labels as an array."""
         shape = (self.n_bursts, self.screen.payload_symbols, self.screen.columns)
         target = np.lib.format.open_memmap(out, "w+", np.uint8, shape)
-        for start, labels in self._chunks():
-            target[start : start + len(labels)] = labels
+        for bursts, labels in self._chunks():
+            target[bursts] = labels
         target.flush()
 
     def write_csv(self, out: Path) -> None:
         """Write labels as text, one row a symbol."""
         with click.open_file(str(out), "w", encoding="utf-8") as file:
             file.write("burst,symbol," + ",".join(f"column_{c}" for c in range(self.screen.columns)) + "\n")
-            for start, labels in self._chunks():
-                for burst, symbols in enumerate(labels, start):
-                    for symbol, row in enumerate(symbols):
-                        file.write(f"{burst},{symbol},{','.join(map(str, row))}\n")
+            for bursts, labels in self._chunks():
+                for index in np.ndindex(labels.shape[:2]):
+                    file.write(f"{bursts[index[0]]},{index[1]},{','.join(map(str, labels[index]))}\n")
 
     def slots(self) -> Iterator[NDArray[np.uint8]]:
         """(slots, columns) 0/1 of some bursts at a time."""
         sends = np.array(self._sends, np.uint8)
         if isinstance(self.sending, TestLight):
-            lit = np.arange(self.n_bursts * self.burst_slots) % TEST_LIGHT_SLOTS < self.sending.n_lit
-            yield lit[:, None] * sends
+            yield self.sending.slots(self.n_bursts * self.burst_slots)[:, None] * sends
             return
-        for start, labels in self._chunks():
-            weights = self.weights if len(self.weights) == 1 else self.weights[start : start + len(labels)]
+        for bursts, labels in self._chunks():
+            weights = self.weights if len(self.weights) == 1 else self.weights[bursts]
             packets = packet_slots_of(labels, weights).transpose(0, 2, 1)
             yield np.tile(packets, (1, self.screen.repeats, 1)).reshape(-1, sends.size) * sends
 
@@ -235,24 +219,20 @@ class _Plan:
             "w": self.weights[0].tolist(),
             "payload_bits": [*map(mul, bits, sends)],
             "frames": [],
-            "payload": {
-                burst: [text * is_lit for text, is_lit in zip(row, sends, strict=True)]
-                for burst, row in enumerate(rows)
-            },
+            "payload": {burst: [*map(mul, row, sends)] for burst, row in enumerate(rows)},
             "written_by": "vlc-rx encode",
         }
 
     def summary(self) -> str:
         """What is sent, and how long a camera needs for a file."""
         screen, weights = self.screen, self.weights
-        burst_s = screen.packet_s * screen.repeats
-        sent = f"{plural(self.n_bursts, 'burst')} of {screen.name}, {self.n_bursts * burst_s:.3g} s"
-        lines = [f"{self.sending.summary}; {sent}"]
-        if isinstance(self.sending, FileSending):
-            bits = sum(visible_bits_of_burst(row, screen.payload_symbols) for row in weights) / len(weights)
-            needed = self.sending.ready_bits / (bits * 31 / 32) * burst_s / _USUAL_READOUT
-            lines.append(
-                f"a camera that sees all columns for {_USUAL_READOUT:.0%} of the time needs about {needed:.1f} s, and "
-                f"an announcement, which comes every {32 * burst_s:.2g} s; send on until it has come"
-            )
-        return "\n".join(lines)
+        burst_s, n_bursts = screen.packet_s * screen.repeats, plural(self.n_bursts, "burst")
+        sent = f"{self.sending.summary}; {n_bursts} of {screen.name}, {self.n_bursts * burst_s:.3g} s"
+        if not isinstance(self.sending, FileSending):
+            return sent
+        bits = sum(visible_bits_of_burst(row, screen.payload_symbols) for row in weights) / len(weights)
+        needed = self.sending.ready_bits / (bits * 31 / 32) * burst_s / _USUAL_READOUT
+        return (
+            f"{sent}\na camera that sees all columns for {_USUAL_READOUT:.0%} of the time needs about {needed:.1f} s, "
+            f"and an announcement, which comes every {32 * burst_s:.2g} s; send on until it has come"
+        )

@@ -1,22 +1,25 @@
 """`vlc-rx inspect`: a page that shows every stage of the reception of a photo, or of a clip and one of its frames."""
 
-from __future__ import annotations
-
 import re
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from rxcli.cli.common import force_argument, options, receiver_arguments, receiver_options
 from rxcli.cli.kinds import FOLDER
 from rxcli.errors import ExitCode, InputError
-
-if TYPE_CHECKING:
-    from rxcli.options import ReceiverOptions
-    from rxcli.outputs import Output
-    from rxcli.types import Frame, FrameResult
+from rxcli.ingest import open_source
+from rxcli.options import ReceiverOptions
+from rxcli.outputs import Output, claim, claim_own_folder, write_whole
+from rxcli.receiver.receive import receive
+from rxcli.results.cameras import camera_of, screen_of
+from rxcli.results.page import MARK, inspection_page
+from rxcli.results.report import format_link
+from rxcli.results.truth import Scorer, load_truth, truth_for
+from rxcli.runs.batch import standard_decoder
+from rxcli.types import Frame, FrameResult
 
 #: Frames of a clip that its timeline shows.
 _MAX_FRAMES = 240
@@ -38,9 +41,6 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
 
     Of a clip, the first frames are received, and one is shown in full.
     """
-    from rxcli.outputs import claim, claim_own_folder
-    from rxcli.results.report import format_link
-
     folder = out if out is not None else Path(f"inspect-{_stem(path)}")
     page = folder / "index.html"
     claim([page_output(folder)], (path,), (), force)
@@ -57,9 +57,6 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
 
 def page_output(folder: Path) -> Output:
     """The page in a folder, which may replace an earlier one."""
-    from rxcli.outputs import Output
-    from rxcli.results.page import MARK
-
     return Output("--out", folder / "index.html", re.compile(re.escape(MARK.encode())), makes_folder=True)
 
 
@@ -84,10 +81,6 @@ def write_page(
     Raises:
         InputError: the source cannot be read, or has no such frame.
     """
-    from rxcli.outputs import claim_own_folder, write_whole
-    from rxcli.results.cameras import camera_of, screen_of
-    from rxcli.results.page import inspection_page
-
     results, picture, taps = _received(path, frame, options, truth)
     shown = next(result for result in results if result.frame == picture.index)
     screen, camera = screen_of(shown, options.screens), camera_of(picture, shown, options.cameras)
@@ -110,11 +103,6 @@ def _received(
     Raises:
         InputError: the source cannot be read, or has no such frame.
     """
-    from rxcli.ingest import open_source
-    from rxcli.receiver.receive import receive
-    from rxcli.results.truth import Scorer, load_truth, truth_for
-    from rxcli.runs.batch import standard_decoder
-
     found = truth_for(path, truth)
     scorer = Scorer(load_truth(found)) if found else None
     n_frames = max(_MAX_FRAMES, (number or 0) + 1)

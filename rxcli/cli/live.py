@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import force_argument, options, receiver_arguments, receiver_options
+from rxcli.cli.common import force_argument, options, output, receiver_arguments, receiver_options
 from rxcli.cli.kinds import FOLDER, POSITIVE, Exposure
 from rxcli.errors import ExitCode, UsageError, printable
 
@@ -91,15 +91,13 @@ def live(device: Path, **options: Any) -> int:
 
 def _claim(device: Path, options: dict[str, Any]) -> Taken:
     """Refuse to write over what is there; returns the files of the run."""
-    from rxcli.outputs import JOURNAL, Output, claim, claim_folder
+    from rxcli.outputs import JOURNAL, claim, claim_folder
 
     if options["out"] is not None:
         claim_folder("--out", options["out"])
-    output = None
-    if options["json_path"] not in (None, "-"):
-        way_on = "name another file, or replace it with --force"
-        output = Output("--json", Path(options["json_path"]), JOURNAL, way_on=way_on)
-    return claim([output], (device,), (*options["screens"], *options["cameras"]), options["force"])
+    way_on = "name another file, or replace it with --force"
+    journal = output("--json", options["json_path"], JOURNAL, way_on=way_on)
+    return claim([journal], (device,), (*options["screens"], *options["cameras"]), options["force"])
 
 
 def _settings(options: dict[str, Any]) -> CameraSettings:
@@ -120,8 +118,7 @@ def _writer(json_path: str | None, stack: ExitStack) -> Callable[[FrameResult], 
 
     if json_path is None:
         return _show
-    to_stdout = json_path == "-"
-    put = print_line if to_stdout else stack.enter_context(closing(Journal(Path(json_path)))).append
+    put = print_line if json_path == "-" else stack.enter_context(closing(Journal(Path(json_path)))).append
     return lambda result: put(to_json_line(result))
 
 
@@ -195,9 +192,9 @@ class Status:
 
     def show_if_due(self, now_s: float | None = None, changed: bool = False) -> None:
         """Show the state if it is time, also where no whole frame comes."""
-        now_s = time.monotonic() if now_s is None else now_s
         from rxcli.cli.printing import is_terminal
 
+        now_s = time.monotonic() if now_s is None else now_s
         if changed or now_s - self._shown_s >= (_TERMINAL_S if is_terminal(sys.stderr) else _LOG_S):
             self._shown_s = now_s
             self._show()

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import io
+import secrets
+import signal
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,30 +39,13 @@ def serve(device: Path | None, **options: Any) -> int:
     Without --host the page can be opened on this machine alone. With --host it can be opened by whoever has the
     address that is shown, which holds a secret; a phone reads it from the QR code.
     """
-    _check_extra()
-    import asyncio
-
-    site = _site(device, options)
-    asyncio.run(_run(site))
-    click.echo("stopped", err=True)
-    return ExitCode.OK
-
-
-def _check_extra() -> None:
-    from importlib.util import find_spec
-
-    missing = [name for name in ("aiohttp", "segno") if find_spec(name) is None]
-    if missing:
-        raise UsageError(f"the page needs the package {missing[0]}", "pip install '.[web]'")
-
-
-def _site(device: Path | None, options: dict[str, Any]) -> Site:
-    import secrets
-
+    for package in ("aiohttp", "segno"):
+        if find_spec(package) is None:
+            raise UsageError(f"the page needs the package {package}", "pip install '.[web]'")
     from rxcli.ingest.v4l2 import CameraSettings
     from rxcli.web.server import Bounds, Site
 
-    return Site(
+    site = Site(
         options=receiver_options(options, soft_bits=True),
         host=options["host"] or "127.0.0.1",
         port=options["port"],
@@ -67,32 +55,29 @@ def _site(device: Path | None, options: dict[str, Any]) -> Site:
         keep=options["keep"],
         bounds=Bounds(upload_bytes=options["max_upload"] << 20, keep_bytes=options["max_kept"] << 20),
     )
+    asyncio.run(_run(site))
+    click.echo("stopped", err=True)
+    return ExitCode.OK
 
 
 async def _run(site: Site) -> None:
-    import asyncio
-    import signal
-
     from rxcli.web.server import Server
 
     stopped = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # before there is anything to leave behind
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
     async with Server(site) as server:
+        for_phones = " For a phone in the same network: vlc-rx serve --host 0.0.0.0"
         if site.token is not None:
+            for_phones = ""
             _show_qr(server.address)
         click.echo(server.address)
-        hint = "Ctrl-C stops it."
-        if site.token is None:
-            hint += " For a phone in the same network: vlc-rx serve --host 0.0.0.0"
-        click.echo(hint, err=True)
+        click.echo(f"Ctrl-C stops it.{for_phones}", err=True)
         sys.stdout.flush()
         await stopped.wait()
 
 
 def _show_qr(address: str) -> None:
-    import io
-
     import segno
 
     text = io.StringIO()

@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from math import isfinite, nan
@@ -12,7 +13,7 @@ import click
 import numpy as np
 
 from rxcli import outputs
-from rxcli.cli.common import force_argument, options
+from rxcli.cli.common import force_argument, options, output
 from rxcli.cli.kinds import FILE, FOLDER, POSITIVE, Exposure
 from rxcli.cli.printing import with_progress
 from rxcli.cli.sending import payload_bytes, sending_of
@@ -101,15 +102,14 @@ def _claim(out: Path, options: dict[str, Any]) -> None:
     """Refuse to replace a file that is no earlier capture, recognised by the truth beside it."""
     truth = truth_path(out)
     is_ours = truth.is_file() and outputs.TRUTH.search(truth.read_bytes()) is not None
-    found = [outputs.Output("OUT", out, outputs.ANYTHING if is_ours else outputs.NEVER)]
-    found.append(outputs.Output("the truth of OUT", truth, outputs.TRUTH))
-    if options["camera_profile"] is not None:
-        found.append(outputs.Output("--camera-profile", options["camera_profile"], outputs.SIMULATED_CAMERA))
+    found = [output("OUT", out, outputs.ANYTHING if is_ours else outputs.NEVER)]
+    found.append(output("the truth of OUT", truth, outputs.TRUTH))
+    found.append(output("--camera-profile", options["camera_profile"], outputs.SIMULATED_CAMERA))
     if options["waveforms"] is not None:
         outputs.claim_folder("--waveforms", options["waveforms"])
         names = (_SLOT_FILE, *PICTURE_FILES)
         patterns = {name: outputs.PICTURE if name.endswith(".png") else outputs.WAVEFORMS for name in names}
-        found += [outputs.Output("--waveforms", options["waveforms"] / name, ours) for name, ours in patterns.items()]
+        found += [output("--waveforms", options["waveforms"] / name, ours) for name, ours in patterns.items()]
     inputs = [options["picture"], options["payload"], *filter(None, (options["file_path"], options["slots"]))]
     outputs.claim(found, inputs, (options["screen"],), options["force"])
 
@@ -136,19 +136,16 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
     sent, given = _sent(options, scene.screen), _given(options, _SCENE_OPTIONS)
     scene = replace(scene, w=_weights(options["weights"]), **sent, **given)
     scene = _with_pose(scene, options)
-    if options["readout_s"] is not None:
-        scene = scene.read_in(options["readout_s"])
-    if options["exposure_slots"] is not None:
-        scene = scene.metered(options["exposure_slots"] / scene.screen.slot_rate_hz)
-    if options["exposure_s"] is not None:
-        scene = replace(scene, exposure_s=options["exposure_s"])
-    if options["electrons"] is not None:
-        scene = replace(scene, light_e_per_s=options["electrons"] / scene.exposure_s)
-    if options["column_delays"] is not None:
-        delays = _numbers(options["column_delays"], "--column-delays", (1, scene.screen.columns))
-        scene = replace(scene, column_delay_slots=delays if len(delays) > 1 else delays[0])
-    if options["scale"] is not None:
-        scene = scene.scaled(options["scale"], keep_readout=options["keep_readout"])
+    changes: dict[str, Callable[[Any], Scene]] = {
+        "readout_s": lambda seconds: scene.read_in(seconds),
+        "exposure_slots": lambda slots: scene.metered(slots / scene.screen.slot_rate_hz),
+        "exposure_s": lambda seconds: replace(scene, exposure_s=seconds),
+        "electrons": lambda electrons: replace(scene, light_e_per_s=electrons / scene.exposure_s),
+        "column_delays": lambda text: replace(scene, column_delay_slots=_delays(text, scene.screen.columns)),
+        "scale": lambda scale: scene.scaled(scale, keep_readout=options["keep_readout"]),
+    }
+    for name, value in _given(options, changes).items():
+        scene = changes[name](value)
     return _for_format(scene, file_format)
 
 
@@ -187,7 +184,7 @@ def _for_format(scene: Scene, file_format: str) -> Scene:
     return replace(scene, n_frames=1) if file_format in _STILLS else scene
 
 
-def _given(options: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+def _given(options: dict[str, Any], names: Iterable[str]) -> dict[str, Any]:
     return {name: options[name] for name in names if options[name] is not None}
 
 
@@ -200,6 +197,11 @@ def _with_pose(scene: Scene, options: dict[str, Any]) -> Scene:
         pose = replace(pose, corners=tuple(zip(values[::2], values[1::2], strict=True)))
     is_turned = abs((pose.roll_deg + 180) % 360 - 180) > 90
     return replace(scene, pose=pose, orientation=3 if is_turned else scene.orientation)
+
+
+def _delays(text: str, n_columns: int) -> float | tuple[float, ...]:
+    delays = _numbers(text, "--column-delays", (1, n_columns))
+    return delays if len(delays) > 1 else delays[0]
 
 
 def _numbers(text: str, option: str, counts: tuple[int, ...]) -> tuple[float, ...]:

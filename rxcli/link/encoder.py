@@ -31,8 +31,6 @@ _LABEL_WEIGHTS = 1 << np.arange(LABEL_BITS - 1, -1, -1)
 _BATCH = 64
 #: Bursts of random payload or of a counter, unless more are asked for.
 _RAW_BURSTS = 64
-#: Period of light without packets.
-TEST_LIGHT_SLOTS = 4
 
 Labels = NDArray[np.uint8]
 
@@ -240,6 +238,10 @@ class TestLight:
     """Light without packets: of every four slots some lit ones, then dark ones."""
 
     n_lit: int
+
+    def slots(self, n: int) -> NDArray[np.bool_]:
+        """(n,) whether slots are lit."""
+        return np.arange(n) % 4 < self.n_lit
 
     def usual_bursts(self, columns: int, payload_symbols: int) -> int:
         """Two, which have a multiple of four slots on any screen."""

@@ -12,16 +12,7 @@ from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predi
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.receiver.light import Exposure, dark_sigma
 from rxcli.receiver.sync.clock import sample_slots
-from rxcli.types import (
-    BoolArray,
-    Clock,
-    ColumnResult,
-    Float32Array,
-    FloatArray,
-    FrameResult,
-    RowProfiles,
-    SlotSamples,
-)
+from rxcli.types import BoolArray, Clock, ColumnResult, Float32Array, FloatArray, FrameResult, RowProfiles, SlotSamples
 
 #: Samples of a slot, and slots over which one clock residual is measured.
 _PER_SLOT, _RESIDUAL_SLOTS = 10, 30

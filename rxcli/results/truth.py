@@ -138,9 +138,7 @@ def wrong_bits(received: str, n_received: int, sent: str, n_sent: int) -> int:
 
 
 def _leading_bits(text: str, n_bits: int) -> int:
-    surplus = 4 * len(text) - n_bits
-    value = int(text, 16) if text else 0
-    return value >> surplus if surplus >= 0 else value << -surplus
+    return int(text or "0", 16) >> 4 * len(text) - n_bits
 
 
 @dataclass(frozen=True, slots=True)

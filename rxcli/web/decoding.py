@@ -7,7 +7,6 @@ import resource
 import signal
 import time
 import warnings
-from collections import OrderedDict
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -30,6 +29,7 @@ from rxcli.results.cameras import camera_of, estimated_camera, screen_of
 from rxcli.results.columns import column_rows, packet_rows, text_rows
 from rxcli.results.overlay import Preview, picture_of, preview
 from rxcli.results.record import to_record
+from rxcli.results.summary import SourceSummary
 from rxcli.runs.batch import Source, standard_decoder, use_one_thread
 from rxcli.runs.processes import resident_bytes, start_process
 from rxcli.types import Frame, FrameResult, ObjectProgress
@@ -177,7 +177,7 @@ def _work(connection: Connection, options: ReceiverOptions) -> None:
         signal.signal(number, signal.SIG_IGN)
     _confine()
     _warm_up(options)
-    sessions: OrderedDict[str, PhotoCollector] = OrderedDict()
+    sessions: dict[str, PhotoCollector] = {}
     with suppress(EOFError, OSError):
         while True:
             path, name, session = connection.recv()
@@ -185,16 +185,14 @@ def _work(connection: Connection, options: ReceiverOptions) -> None:
             send(connection, answer_for(Path(path), name, options, partial(send, connection), photos))
 
 
-def _photos_of(
-    session: str, sessions: OrderedDict[str, PhotoCollector], options: ReceiverOptions
-) -> PhotoCollector | None:
+def _photos_of(session: str, sessions: dict[str, PhotoCollector], options: ReceiverOptions) -> PhotoCollector | None:
     """Combined photos of a session so far, or None without a session."""
     if not session:
         return None
-    sessions.setdefault(session, PhotoCollector(options.screens, min(options.file_memory_mb, _SESSION_MB)))
-    sessions.move_to_end(session)
+    known = sessions.pop(session, None)
+    sessions[session] = known or PhotoCollector(options.screens, min(options.file_memory_mb, _SESSION_MB))
     if len(sessions) > _SESSIONS:
-        sessions.popitem(last=False)
+        del sessions[next(iter(sessions))]  # the one whose last photo is the oldest
     return sessions[session]
 
 
@@ -327,8 +325,7 @@ class _Gathered(Previews):
         self._packets: list[dict[str, Any]] = []
         self._texts: list[dict[str, Any]] = []
         self._files: list[dict[str, Any]] = []
-        self._n_frames = self._n_received = self._n_unsure = 0
-        self._cut_short = False
+        self._summary, self._cut_short = SourceSummary(""), False
         #: Whether packets or texts were received since the last answer, other than in the first frame.
         self.has_news = False
 
@@ -343,13 +340,10 @@ class _Gathered(Previews):
         """Add the next result."""
         if self._cut_short and result.status == "unreadable":
             return
-        self._n_frames += 1
+        self._summary.add(result)
         texts, found = text_rows(result), packet_rows(result)
         self._texts += texts
         self._files = _files(result.progress)
-        received = sum(packet.is_believable for packet in result.packets)
-        self._n_received += received
-        self._n_unsure += len(result.packets) - received
         self._packets += found[: _MAX_PACKETS - len(self._packets)]
         self.has_news = result.frame > 0 and (self.has_news or bool(texts or found))
         if self._best is None or len(found) > self._best[0]:
@@ -361,7 +355,8 @@ class _Gathered(Previews):
         if self._best is None:
             return refusal("it holds no picture", "send another file")
         _, result, picture = self._best
-        packets, counted = self._packets, report.count_packets(self._n_received, self._n_unsure)
+        packets, n = self._packets, self._summary.n
+        counted = report.count_packets(n["received"], n["unsure"])
         reason, advice = ("", "") if packets else split_message(result)
         columns = [
             row | {"message": row["message"] and without_commands(row["message"])} for row in column_rows(result)
@@ -375,7 +370,7 @@ class _Gathered(Previews):
             "texts": list(self._texts),
             "files": list(self._files),
             "packets": list(packets),
-            "n_frames": self._n_frames,
+            "n_frames": n["frames"],
             "cut_short": self._cut_short,
             "screen": result.screen_profile,
             "camera": result.camera_profile,
