@@ -102,8 +102,7 @@ class _Results:
                 raise UsageError(f"no profile was written: {doubts[0]}", "use another lamp, or insist with --force")
             write_profile(extend(profile_to_extend(self._target, metadata)), self._target)
             lines = [*lines, ("written", str(self._target))]
-        if self._json_path is not None:
-            write_json({**record, "profile": None if self._target is None else str(self._target)}, self._json_path)
+        write_json({**record, "profile": self._target and str(self._target)}, self._json_path)
         if self._json_path != "-":
             click.echo("\n".join(f"{label:11} {text}" for label, text in lines))
 

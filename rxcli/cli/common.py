@@ -125,12 +125,14 @@ def json_output(path: str | None, *keys: str) -> Output | None:
     return output("--json", path, json_with(*keys))
 
 
-def write_json(value: Any, path: str) -> None:
-    """Write `value` as indented JSON to a file, or to stdout where `path` is "-".
+def write_json(value: Any, path: str | None) -> None:
+    """Write `value` as indented JSON to a file, or to stdout where `path` is "-"; nowhere where it is None.
 
     Raises:
         InputError: the file cannot be written.
     """
+    if path is None:
+        return
     import msgspec
 
     from rxcli.outputs import write_whole

@@ -36,10 +36,10 @@ def profiles(context: click.Context) -> None:
 def list_profiles(json_path: str | None, force: bool) -> None:
     """List the profiles that go by their names: the user's own and the shipped ones."""
     claim([json_output(json_path, "screens", "cameras")], force=force)
-    known = _known()
-    if json_path is not None:
-        kinds = {f"{kind}s": [entry for entry in known if entry[0].kind == kind] for kind in ("screen", "camera")}
-        write_json({kind: [_listed(*entry) for entry in entries] for kind, entries in kinds.items()}, json_path)
+    known, listed = _known(), {"screens": list[Any](), "cameras": list[Any]()}
+    for profile, origin, path in known:
+        listed[f"{profile.kind}s"].append({**msgspec.to_builtins(profile), "origin": origin, "path": str(path)})
+    write_json(listed, json_path)
     if json_path == "-":
         return
     for profile, origin, _ in known:
@@ -61,10 +61,6 @@ def _about(profile: ScreenProfile | CameraProfile) -> str:
     return modes + ("; lens" if profile.lens else "")
 
 
-def _listed(profile: ScreenProfile | CameraProfile, origin: str, path: Path) -> Any:
-    return {**msgspec.to_builtins(profile), "origin": origin, "path": str(path)}
-
-
 @profiles.command()
 @click.argument("name")
 @_JSON
@@ -73,8 +69,7 @@ def show(name: str, json_path: str | None, force: bool) -> None:
     """Show the profile NAME, one that is known or a TOML file."""
     claim([json_output(json_path, "format", "kind", "name")], profiles=(name,), force=force)
     profile = load_profile(name)
-    if json_path is not None:
-        write_json(msgspec.to_builtins(profile), json_path)
+    write_json(msgspec.to_builtins(profile), json_path)
     if json_path != "-":
         click.echo(dump_profile(profile), nl=False)
 
@@ -112,8 +107,7 @@ def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | No
         except InputError as error:
             log.error("%s", error)
             codes.append(error.exit_code)
-    if json_path is not None:
-        write_json(records, json_path)
+    write_json(records, json_path)
     if json_path != "-":
         for record in records:
             click.echo(f"{record['source']}: {record['camera'] or 'no profile'} ({record['reason']})")
@@ -131,13 +125,14 @@ def _first_frame(path: Path) -> Frame:
 
 def _choice(frame: Frame, path: Path, cameras: list[CameraProfile]) -> dict[str, Any]:
     """The profile that the file gets and the reason, with what decided it."""
-    metadata = frame.metadata
-    found = match_camera(cameras, metadata.make, metadata.model, frame.width, frame.height)
-    mode = found.mode_for(frame.width, frame.height) if found else None
+    metadata, width, height = frame.metadata, frame.width, frame.height
+    found = match_camera(cameras, metadata.make, metadata.model, width, height)
+    mode = found.mode_for(width, height) if found else None
     return {
         "source": str(path),
         **{name: getattr(metadata, name) for name in ("make", "model", "lens")},
-        **{name: getattr(frame, name) for name in ("width", "height")},
+        "width": width,
+        "height": height,
         "camera": found.name if found else None,
         "mode": mode.name if mode else None,
         "line_delay_s": mode.line_delay_s if mode else None,

@@ -38,6 +38,16 @@ _SLOT_FILE = "slots.csv"
 _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm", "hand_px")
 
 
+def _list(context: click.Context, _parameter: click.Parameter, wanted: bool) -> None:
+    """Print the names of pictures and end."""
+    if wanted:
+        click.echo("\n".join(picture_names()))
+        context.exit()
+
+
+_LIST = {"is_eager": True, "expose_value": False, "callback": _list}
+
+
 @click.command()
 @click.argument("out", type=click.Path(dir_okay=False, path_type=Path))
 @options(
@@ -72,14 +82,7 @@ _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_ra
     ("--waveforms", FOLDER, None, "Also write what drives a real screen."),
     ("--camera-profile", FILE, None, "Also write a camera profile (TOML) that fits the capture."),
 )
-@click.option(
-    "--list",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=lambda context, _parameter, wanted: _list(context, wanted),
-    help="Print the names of pictures and exit.",
-)
+@options(("--list", None, False, "Print the names of pictures and exit.", _LIST))
 @force_argument
 def simulate(out: Path, **options: Any) -> None:
     """Simulate a capture of a mini-LED screen and write it to OUT, with OUT's name .truth.json beside it."""
@@ -112,13 +115,6 @@ def _claim(out: Path, options: dict[str, Any]) -> None:
         found += [output("--waveforms", options["waveforms"] / name, ours) for name, ours in patterns.items()]
     inputs = [options["picture"], options["payload"], *filter(None, (options["file_path"], options["slots"]))]
     outputs.claim(found, inputs, (options["screen"],), options["force"])
-
-
-def _list(context: click.Context, wanted: bool) -> None:
-    """Print the names of pictures and end."""
-    if wanted:
-        click.echo("\n".join(picture_names()))
-        context.exit()
 
 
 def _format_of(out: Path) -> str:

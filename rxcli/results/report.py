@@ -12,7 +12,7 @@ from typing import Any
 from rxcli.errors import capitalised, printable
 from rxcli.results.columns import PACKET_TABLE, PAYLOAD_TABLE, packet_rows
 from rxcli.results.record import plain
-from rxcli.types import FrameResult, Message, ObjectProgress, ReceivedObject
+from rxcli.types import FrameResult, ObjectProgress, ReceivedObject
 
 #: Hex digits of a payload that a table of 80 characters shows.
 _SHOWN_DIGITS = 20
@@ -39,13 +39,11 @@ def format_link(result: FrameResult) -> list[str]:
 
 def format_received(result: FrameResult) -> list[str]:
     """Texts and files that are complete with a frame, one line each."""
-    return [*map(_message_line, result.messages), *map(format_object, result.objects)]
-
-
-def _message_line(message: Message) -> str:
-    if message.text is None:
-        return f"bytes: {message.data.hex()}"
-    return f"{message.kind}: {printable(message.text)}"
+    texts = (
+        f"bytes: {message.data.hex()}" if message.text is None else f"{message.kind}: {printable(message.text)}"
+        for message in result.messages
+    )
+    return [*texts, *map(format_object, result.objects)]
 
 
 def format_object(received: ReceivedObject) -> str:
@@ -160,18 +158,11 @@ def count_packets(n_received: int, n_unsure: int) -> str:
 
 
 def result_in_words(result: FrameResult) -> str:
-    """What was done for a frame, in one line: screen, camera, time by stage, what was left out."""
-    delay_s, known = result.line_delay_s, result.camera_profile or "estimated"
-    parts = [
-        f"{printable_name(result.source)} frame {result.frame}: {result.status}",
-        "" if result.corners is None else f"screen at {_place(result)}",
-        f"camera {known}: {delay_s * 1e6:.4g} us a row" if delay_s else "",
-        _counts(result) if result.columns else "",
-        *(f"{stage} {value:.0f} ms" for stage, value in result.timing_ms.items()),
-        *(f"left out: {name} {count}" for name, count in result.skipped.items()),
-        f"auto-encoder: {plain(result.denoiser)}" if result.denoiser else "",
-    ]
-    return "; ".join(filter(None, parts))
+    """What was done for a frame, in one line: its heading, the place of its screen, times, what was left out."""
+    details = {"ms": result.timing_ms, "left out": result.skipped, "auto-encoder": result.denoiser}
+    details |= {"screen at": _place(result), "us a row": result.line_delay_s and 1e6 * result.line_delay_s}
+    shown = (f"{name} {plain(value)}" for name, value in details.items() if value)
+    return "; ".join([format_heading(result), *shown])
 
 
 def _place(result: FrameResult) -> str:
