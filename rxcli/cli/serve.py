@@ -42,10 +42,16 @@ def serve(device: Path | None, **options: Any) -> int:
     for package in ("aiohttp", "segno"):
         if find_spec(package) is None:
             raise UsageError(f"the page needs the package {package}", "pip install '.[web]'")
+    asyncio.run(_run(_site(device, options)))
+    click.echo("stopped", err=True)
+    return ExitCode.OK
+
+
+def _site(device: Path | None, options: dict[str, Any]) -> Site:
     from rxcli.ingest.v4l2 import CameraSettings
     from rxcli.web.server import Bounds, Site
 
-    site = Site(
+    return Site(
         options=receiver_options(options, soft_bits=True),
         host=options["host"] or "127.0.0.1",
         port=options["port"],
@@ -55,9 +61,6 @@ def serve(device: Path | None, **options: Any) -> int:
         keep=options["keep"],
         bounds=Bounds(upload_bytes=options["max_upload"] << 20, keep_bytes=options["max_kept"] << 20),
     )
-    asyncio.run(_run(site))
-    click.echo("stopped", err=True)
-    return ExitCode.OK
 
 
 async def _run(site: Site) -> None:
