@@ -145,7 +145,7 @@ class BeaconSearch:
         choices += scored(product(earlier, range(period), (as_numbered,)))
         if max((gain for gain, *_ in choices), default=np.inf) < _COPIES and settled is None:
             # Photographs may be numbered otherwise; that they carry the same message must then be certain.
-            others = product(earlier, range(period), chain(*possible_placements(frame.total)[1:]))
+            renumbered = product(earlier, range(period), chain(*possible_placements(frame.total)[1:]))
             choices += [
                 (gain + MIN_SIMILARITY - _COPIES, known, phase, at) for gain, known, phase, at in scored(others)
             ]

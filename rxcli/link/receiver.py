@@ -79,8 +79,8 @@ class LinkReceiver:
     @staticmethod
     def _object(soft: FrameSoftBits, file: FileState, found: Container) -> ReceivedObject:
         layout, data = file.layout, found.data
-        seen = (soft.source, soft.frame, soft.time_s)
-        return ReceivedObject(found.name, data, len(data), found.sha256, layout.object_id, layout.n_blocks, *seen)
+        place = (soft.source, soft.frame, soft.time_s)
+        return ReceivedObject(found.name, data, len(data), found.sha256, layout.object_id, layout.n_blocks, *place)
 
     @property
     def progress(self) -> list[ObjectProgress]:
