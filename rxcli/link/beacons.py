@@ -137,8 +137,10 @@ class BeaconSearch:
         if frame.similarity < MIN_SIMILARITY:
             return None
 
-        def scored(places: Iterable[tuple[_Round, int, Placement]]) -> list[tuple[float, _Round, int, Placement]]:
-            return [(known.gain(frame, phase, at), known, phase, at) for known, phase, at in places]
+        def scored(
+            places: Iterable[tuple[_Round, int, Placement]], less: float = 0.0
+        ) -> list[tuple[float, _Round, int, Placement]]:
+            return [(known.gain(frame, phase, at) - less, known, phase, at) for known, phase, at in places]
 
         earlier = [known for known in rounds if known.epoch != soft.epoch]
         choices = scored((known, known.phase, known.placement) for known in rounds if known.epoch == soft.epoch)
@@ -146,9 +148,7 @@ class BeaconSearch:
         if max((gain for gain, *_ in choices), default=np.inf) < _COPIES and settled is None:
             # Photographs may be numbered otherwise; that they carry the same message must then be certain.
             renumbered = product(earlier, range(period), chain(*possible_placements(frame.total)[1:]))
-            choices += [
-                (gain + MIN_SIMILARITY - _COPIES, known, phase, at) for gain, known, phase, at in scored(others)
-            ]
+            choices += scored(renumbered, _COPIES - MIN_SIMILARITY)
         blank = _Round(np.zeros((period, *self._shape), np.float32), np.zeros(period), 0.0, soft.epoch)
         choices.insert(0, (MIN_SIMILARITY, blank, 0, as_numbered))
         _, candidate, phase, placement = max(choices, key=itemgetter(0))
