@@ -1,6 +1,6 @@
 """Lens model from pictures of a chessboard or ChArUco board."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -197,7 +197,7 @@ def _edge_width(image: GrayImage, corners: Float32Array, board: Board) -> tuple[
     return contrast / max(float(np.percentile(slope, 99)), 1e-6), float(np.sqrt(area / squares))
 
 
-def calibrate_lens(found: Iterable[Sighting | Rejected], width: int, height: int) -> LensCalibration:
+def calibrate_lens(found: Sequence[Sighting | Rejected], width: int, height: int) -> LensCalibration:
     """Fit pinhole, radial (k1 k2 k3) and tangential (p1 p2) distortion; drop the worst board while one stands out.
 
     Args:
@@ -208,9 +208,8 @@ def calibrate_lens(found: Iterable[Sighting | Rejected], width: int, height: int
     Raises:
         ReceiverError: fewer than three usable boards, or the fit fails.
     """
-    results = list(found)
-    rejected = [r for r in results if isinstance(r, Rejected)]
-    boards = [s for s in results if isinstance(s, Sighting)]
+    rejected = [r for r in found if isinstance(r, Rejected)]
+    boards = [s for s in found if isinstance(s, Sighting)]
     if len(boards) < MIN_BOARDS:
         reasons = "; ".join(f"{r.name}: {r.reason}" for r in rejected[:3])
         reason = f"{len(boards)} usable boards, at least {MIN_BOARDS} are needed ({reasons or 'no pictures'})"

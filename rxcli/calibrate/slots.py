@@ -30,9 +30,8 @@ def calibrate_slots(frames: Sequence[Frame], screen: ScreenProfile, axis: Axis =
     Raises:
         ReceiverError: no picture gives a packet.
     """
-    options = ReceiverOptions(screens=(screen,), cameras=())
     upright = [f if axis == "rows" else replace(f, pixels=np.rot90(f.pixels)) for f in frames]
-    results = [receive_frame(frame, options) for frame in upright]
+    results = [receive_frame(frame, ReceiverOptions(screens=(screen,), cameras=())) for frame in upright]
     confirmed = [r.estimated for r in results if any(p.is_believable for p in r.packets)]
     if not confirmed:
         reason = next((f" ({r.message.split(';')[0]})" for r in results if r.message), "")
@@ -42,8 +41,8 @@ def calibrate_slots(frames: Sequence[Frame], screen: ScreenProfile, axis: Axis =
     bent = [estimated for estimated in confirmed if "k1" in estimated]
     surest = min(bent, key=lambda estimated: estimated["k1"][1], default=confirmed[0])
     lens = camera_profile(surest, "estimated", None, None, upright[0].width, upright[0].height).lens
-    warnings = [_CORRECTED] if bent else []
-    warnings += [_REVERSED] if any(estimated["readout_reversed"][0] for estimated in confirmed) else []
+    is_reversed = any(estimated["readout_reversed"][0] for estimated in confirmed)
+    warnings = (_CORRECTED,) * bool(bent) + (_REVERSED,) * is_reversed
     exposure = ExposureEstimate(None, None, "not estimated from data; use a lamp and --frequency")
     shape, periods = (frames[0].height, frames[0].width), upright[0].height * value * screen.slot_rate_hz
-    return ShutterCalibration(axis, shape, value, sd, periods, exposure, warnings=tuple(warnings), lens=lens)
+    return ShutterCalibration(axis, shape, value, sd, periods, exposure, warnings=warnings, lens=lens)

@@ -1,11 +1,14 @@
-"""Read frames ahead in a separate thread, so that file decoding does not wait for the receiver."""
+"""Work ahead in other threads and processes, so that file decoding does not wait for the receiver."""
 
 import os
 import sys
-from collections.abc import Generator
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, suppress
+from itertools import islice
 from queue import Empty, Queue
 from threading import Event, Thread, get_native_id
+from typing import Any
 
 from rxcli.types import Frame
 
@@ -13,6 +16,15 @@ from rxcli.types import Frame
 _MAX_BYTES, _MIN_FRAMES, _MAX_FRAMES = 60_000_000, 2, 16
 #: Increase of the thread's nice value over that of the process.
 _NICER = 5
+
+
+def in_order(items: Iterable[Any], submit: Callable[[Any], Any], n_ahead: int) -> Iterator[tuple[Any, Any]]:
+    """Each item with what `submit` makes of it, which is called for `n_ahead` items before the first is taken."""
+    waiting = iter(items)
+    submitted = deque((item, submit(item)) for item in islice(waiting, n_ahead))
+    while submitted:
+        yield submitted.popleft()
+        submitted.extend((item, submit(item)) for item in islice(waiting, 1))
 
 
 def read_ahead(frames: Generator[Frame, None, None]) -> Generator[Frame, None, None]:

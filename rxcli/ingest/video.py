@@ -6,10 +6,10 @@ go to simplejpeg in a few threads here (2.3 to 2.6 times faster). Some frames ar
 
 import errno
 import os
-from collections import deque
 from collections.abc import Generator, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError, reason_of
-from rxcli.ingest.ahead import read_ahead
+from rxcli.ingest.ahead import in_order, read_ahead
 from rxcli.ingest.damage import WholeFrames
 from rxcli.ingest.ends import is_cut
 from rxcli.ingest.gpmf import stated_readout_s
@@ -207,21 +207,16 @@ def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) 
 
     limited = stream.codec_context.color_range not in (0, _FULL_RANGE)
     black, white = (_LIMITED_BLACK, _LIMITED_WHITE) if limited else (0, 255)
-    waiting: deque[tuple[tuple[float, bool], bytes, Future[NDArray[np.uint8]]]] = deque()
+    packets = (packet for packet, _ in _packets(container, stream, progress) if packet is not None)
     with ThreadPoolExecutor(_MJPEG_THREADS) as pool:
-        for packet, _ in _packets(container, stream, progress):
-            if packet is not None:
-                data = bytes(packet)
-                picture = pool.submit(decode_luma, data, path, at_once=_MJPEG_AT_ONCE)
-                waiting.append((_time_s(packet, stream, progress), data, picture))
-            while len(waiting) > (_MJPEG_THREADS if packet is not None else 0):
-                (time_s, nominal), data, picture = waiting.popleft()
-                try:
-                    pixels = picture.result()
-                    frame = Frame(pixels, str(path), 0, time_s, black=black, white=white, nominal_time=nominal)
-                    yield replace(frame, colours=colours_of(data))
-                except InputError as error:
-                    progress.damage(str(error).removeprefix(f"{path}: "))
+        decode = partial(decode_luma, source=path, at_once=_MJPEG_AT_ONCE)
+        for packet, picture in in_order(packets, lambda packet: pool.submit(decode, packet), _MJPEG_THREADS + 1):
+            time_s, nominal = _time_s(packet, stream, progress)
+            try:
+                frame = Frame(picture.result(), str(path), 0, time_s, black=black, white=white, nominal_time=nominal)
+                yield replace(frame, colours=colours_of(bytes(packet)))
+            except InputError as error:
+                progress.damage(str(error).removeprefix(f"{path}: "))
 
 
 def _time_s(stamped: Any, stream: Any, progress: _Progress) -> tuple[float, bool]:

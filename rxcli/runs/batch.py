@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -17,10 +17,11 @@ from itertools import chain, islice
 from queue import SimpleQueue
 from threading import Lock, Semaphore, Thread, local
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError, is_out_of_memory, reason_of
 from rxcli.ingest import open_source
+from rxcli.ingest.ahead import in_order
 from rxcli.link.collector import Collector
 from rxcli.options import ReceiverOptions
 from rxcli.outputs import OUTPUT_MARKER
@@ -45,7 +46,6 @@ Decoded = tuple["Source", Iterator[FrameResult]]
 
 #: Results of one source as they come, an error that ends them, and None behind the last.
 _Results = SimpleQueue[FrameResult | Exception | None]
-_T = TypeVar("_T")
 
 #: Errors that end the run, whatever the source.
 _ENDS_RUN = (UsageError, ProfileError, OutputError)
@@ -275,15 +275,6 @@ def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded
     """Decode one source after the other in this process."""
     for source in sources:
         yield source, decoder.results(source)
-
-
-def in_order(sources: Iterable[Source], submit: Callable[[Source], _T], n_ahead: int) -> Iterator[tuple[Source, _T]]:
-    """Each source with what `submit` makes of it, which is called for `n_ahead` sources before the first is taken."""
-    waiting = iter(sources)
-    submitted = deque((source, submit(source)) for source in islice(waiting, n_ahead))
-    while submitted:
-        yield submitted.popleft()
-        submitted.extend((source, submit(source)) for source in islice(waiting, 1))
 
 
 def decode_in_processes(sources: Sequence[Source], decoder: Decoder, workers: int) -> Iterator[Decoded]:

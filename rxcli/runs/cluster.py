@@ -15,8 +15,9 @@ from threading import Thread
 from typing import TYPE_CHECKING, Any
 
 from rxcli.errors import InputError, OutputError, ReceiverError, UsageError, reason_of
+from rxcli.ingest.ahead import in_order
 from rxcli.outputs import PICTURE, TAPS, check_replaceable, make_parent, write_whole
-from rxcli.runs.batch import Decoded, Decoder, Source, in_order, unreadable
+from rxcli.runs.batch import Decoded, Decoder, Source, unreadable
 from rxcli.types import FrameResult
 
 if TYPE_CHECKING:
