@@ -112,7 +112,7 @@ class CameraCounts:
     dropped: int = 0
     damaged: int = 0
     connections: int = 0
-    #: On the driver's clock, which goes on through connections; and of the first frame there.
+    #: Since the first frame, which came then by the driver's clock; that goes on through connections.
     times: FrameTimes = field(default_factory=FrameTimes)
     start_s: float | None = None
 
@@ -286,13 +286,11 @@ class Camera:
         """A frame; where the driver's times do not advance, by the time that passed here, in whole frames."""
         step_s, fps = self._came_s - self._given_s, self.mode.fps
         step_s = max(round(step_s * fps), 1) / fps if fps else step_s
-        time_s, nominal = self.counts.times.next(own_s, step_s)
-        self._given_s = self._came_s
-        if self.counts.start_s is None:
-            self.counts.start_s = time_s
+        self.counts.start_s = own_s if self.counts.start_s is None else self.counts.start_s
+        time_s, nominal = self.counts.times.next(own_s - self.counts.start_s, step_s)
+        self._given_s, index = self._came_s, self.counts.delivered
         self.counts.delivered += 1
         metadata, (black, white) = Metadata(model=self._card, exposure_s=self.exposure_s), self._levels()
-        index, time_s = self.counts.delivered - 1, time_s - self.counts.start_s
         return Frame(luma, str(self._path), index, time_s, metadata, black=black, white=white, nominal_time=nominal)
 
 

@@ -81,10 +81,10 @@ def collect_sources(paths: Iterable[str], suffixes: frozenset[str]) -> list[Sour
         suffixes: lower-case suffixes, with the dot, of files to take from folders.
     """
     found = [source for path in paths for source in _sources_of(path, suffixes)]
-    return _with_subfolders(list({os.path.normpath(source.name): source for source in found}.values()))
+    return list(_with_subfolders({os.path.normpath(source.name): source for source in found}.values()))
 
 
-def _with_subfolders(sources: list[Source]) -> list[Source]:
+def _with_subfolders(sources: Iterable[Source]) -> Iterator[Source]:
     """The sources with a place of its own for the taps of each, whatever others are called."""
     folders = [os.path.dirname(os.path.abspath(source.name)) for source in sources]
     try:
@@ -92,14 +92,12 @@ def _with_subfolders(sources: list[Source]) -> list[Source]:
     except ValueError:  # none, or several drives
         common = os.sep
     count: Counter[tuple[str, str]] = Counter()
-    placed = []
     for source, folder in zip(sources, folders, strict=True):
         below = os.path.relpath(folder, common)
         place = (below, plain_name(source.name).casefold())
         count[place] += 1
         own = below if count[place] == 1 else os.path.join(below, f"{count[place]}")
-        placed.append(replace(source, subfolder=own))
-    return placed
+        yield replace(source, subfolder=own)
 
 
 def _sources_of(path: str, suffixes: frozenset[str]) -> Iterator[Source]:
@@ -112,8 +110,7 @@ def _sources_of(path: str, suffixes: frozenset[str]) -> Iterator[Source]:
         listed = ", ".join(sorted(suffix.lstrip(".") for suffix in suffixes))
         problem = f"{path}: the folder holds no picture or clip; name files, or a folder with {listed}"
         yield Source(path, path, problem)
-    for name in files:
-        yield Source(name, name)
+    yield from (Source(name, name) for name in files)
     for error in refused:
         name = error.filename
         problem = f"{name}: the folder may not be read ({error.strerror}); ask for permission, or leave it out"
