@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rxcli.errors import InputError
 from rxcli.ingest.luma import BT601, BT709, Weights
 from rxcli.ingest.metadata import exif_metadata
-from rxcli.ingest.orientation import as_stored, orientation_of
+from rxcli.ingest.orientation import PROBE, as_stored, orientation_of
 from rxcli.ingest.sniff import check_size, damage_explained
 from rxcli.types import Metadata
 
@@ -63,13 +63,10 @@ def _orientation(image: Any) -> int:
     Args:
         image: pillow_heif's, which keeps them private: ("irot", degrees counter-clockwise) or ("imir", axis), in order.
     """
-
-    def view(picture: NDArray[np.int64]) -> NDArray[np.int64]:
-        for name, value, *_ in image._c_image.transformations:
-            if name == "irot":
-                picture = np.rot90(picture, value // 90)
-            elif name == "imir":
-                picture = np.flip(picture, axis=value)
-        return picture
-
-    return orientation_of(view)
+    probe = PROBE
+    for name, value, *_ in image._c_image.transformations:
+        if name == "irot":
+            probe = np.rot90(probe, value // 90)
+        elif name == "imir":
+            probe = np.flip(probe, axis=value)
+    return orientation_of(probe)

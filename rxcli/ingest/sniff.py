@@ -64,8 +64,7 @@ def check_file(path: Path) -> Kind | None:
         info = path.stat()
     except (FileNotFoundError, NotADirectoryError):
         if path.parts and path.parts[0].lower() in ("http:", "https:", "ftp:", "rtsp:"):
-            address = str(path).replace(":/", "://", 1)
-            reason = f"{address}: is an address, and nothing is fetched from the network"
+            reason = f"{str(path).replace(':/', '://', 1)}: is an address, and nothing is fetched from the network"
             raise InputError(reason, "download it first, and name the file") from None
         if path.is_symlink():
             reason = f"{path}: is a link to {os.readlink(path)}, which is not there"

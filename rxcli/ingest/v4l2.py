@@ -350,8 +350,8 @@ def _check_capture(descriptor: int, path: Path) -> str:
     capability = api.v4l2_capability()
     if not _is_known(descriptor, api.VIDIOC_QUERYCAP, capability):
         raise InputError(f"{path}: is no V4L2 device", "name a camera, such as /dev/video0")
-    has_own = capability.capabilities & api.V4L2_CAP_DEVICE_CAPS
-    able = capability.device_caps if has_own else capability.capabilities
+    able = capability.capabilities
+    able = capability.device_caps if able & api.V4L2_CAP_DEVICE_CAPS else able
     needed = api.V4L2_CAP_VIDEO_CAPTURE | api.V4L2_CAP_STREAMING
     if able & needed != needed:
         raise InputError(f"{path}: does not stream pictures", "name the camera's other /dev/video device")
