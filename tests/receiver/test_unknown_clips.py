@@ -162,16 +162,16 @@ def test_a_scene_learns_from_its_own_frames_only(monkeypatch: pytest.MonkeyPatch
 
     class Scene:
         def can_measure_again(self, view: Any) -> bool:
-            return bool(view.flat == "own")
+            return bool(view.name == "own")
 
         def update(self, view: Any, lit: object) -> None:
-            learned.append(view.flat)
+            learned.append(view.name)
 
     ledger = Ledger(ReceiverOptions(), None)
     monkeypatch.setattr(ledger, "_scene", Scene())
     monkeypatch.setattr(ledger, "_add_bursts", lambda view: None)
-    for flat in ("before", "own"):
-        view: Any = SimpleNamespace(numbers=None, flat=flat)
+    for name in ("before", "own"):
+        view: Any = SimpleNamespace(numbers=None, tracked=True, name=name)
         ledger._waiting.append(Waiting(FrameResult("clip", 0, 0.0, "ok"), view))
     timeline: Any = SimpleNamespace(number=lambda view: setattr(view, "numbers", np.zeros(0, int)))
     ledger._number_frames(timeline)

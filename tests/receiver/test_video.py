@@ -259,7 +259,7 @@ def test_frames_before_and_after_an_occlusion_are_looked_at_again(clip: Clip, mo
     measured: list[list[int]] = []
 
     def measure_again(_scene: object, views: list[Any], *_: object) -> None:
-        measured.append([view.bursts.frame for view in views])
+        measured.append([view.context.frame.index for view in views])
 
     monkeypatch.setattr("rxcli.receiver.clip.scene.TrackedScreen.measure_again", measure_again)
     dark = replace(clip.frames[3], pixels=np.full_like(clip.frames[3].pixels, 2))

@@ -88,25 +88,25 @@ class Burst:
 def bursts_of(view: View) -> list[Burst]:
     """What a frame shows of its bursts."""
     assert view.numbers is not None
-    own = view.bursts
-    metrics, shows_payload = channel.by_burst(own.metrics, own.clock), own.shown[..., PREAMBLE_SLOTS:].any(axis=(1, 2))
+    metrics = channel.by_burst(view.metrics, view.clock)
+    shows_payload = view.shown[..., PREAMBLE_SLOTS:].any(axis=(1, 2))
     # Copies that were detected together under another assignment count by themselves.
-    joint = view.joint if view.joint and np.array_equal(view.joint.burst, own.clock.burst) else None
+    joint = view.joint if view.joint and np.array_equal(view.joint.burst, view.clock.burst) else None
     bursts = []
     for index, number in enumerate(view.numbers.tolist()):
-        which = own.clock.burst == index
-        copies, n_observed = own.first_copy + np.flatnonzero(which & shows_payload), own.shown[which].sum(axis=0)
+        which = view.clock.burst == index
+        copies, n_observed = view.first_copy + np.flatnonzero(which & shows_payload), view.shown[which].sum(axis=0)
         evidence = metrics[index]
         if joint is not None:
-            evidence = channel.metrics_of(llr_of(joint.lit[index]) * (n_observed > 0), view.isi_memory)
-        bursts.append(Burst(number, evidence, n_observed, (own.frame,), copies, own.tracked))
+            evidence = channel.metrics_of(llr_of(joint.lit[index]) * (n_observed > 0), 1)
+        bursts.append(Burst(number, evidence, n_observed, (view.context.frame.index,), copies, view.tracked))
     return bursts
 
 
 def lit_slots(view: View, bursts: Sequence[Burst]) -> Float32Array:
     """(C, N) probability that each slot of a frame is lit, by what is known of its bursts."""
     assert view.numbers is not None
-    numbers, clock = view.numbers, view.bursts.clock
+    numbers, clock = view.numbers, view.clock
     lit = np.full((numbers.size, len(view.snr), clock.packet_slots), 0.5, np.float32)
     for burst in bursts:
         lit[numbers == burst.number] = burst.posteriors.lit[0]

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import ScreenProfile
-from rxcli.receiver.clip.common_clock import Start, acquisition_at
+from rxcli.receiver.clip.common_clock import Start, acquisition_at, shows_little
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
@@ -17,7 +16,7 @@ from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, search
-from rxcli.receiver.search.framing import framing_of
+from rxcli.receiver.search.framing import Framing, framing_of
 from rxcli.receiver.search.settings import SETTINGS as search_settings
 from rxcli.receiver.still import initial_pass
 from rxcli.types import FloatArray, Frame
@@ -34,10 +33,10 @@ class Located:
 
     outline: Outline
     context: FrameContext
-    #: None where the screen was moved since, or the camera is that of another frame.
+    #: None where the frame is to be searched at its outline once more.
     found: Found | Failure | None
-    #: Probability of the length of packets, by the frame that showed the camera.
-    framing: float = 1.0
+    #: How sure the length of packets is, by the frame that showed the camera; None where it shows none.
+    framing: Framing | None = None
 
     @property
     def camera_error(self) -> float:
@@ -78,11 +77,21 @@ class Located:
         """Whether packets settle the outline beyond doubt."""
         return self.evidence >= search_settings.plain and not self.is_open
 
-    def moved_to(self, corners: FloatArray) -> Located:
-        """The same with the screen at the corners (4, 2)."""
-        return Located(
-            replace(self.outline, corners=corners), replace(self.context, sampled_corners=corners), None, self.framing
-        )
+    @property
+    def is_shown(self) -> bool:
+        """Whether the picture's texture hides nothing that further frames could show."""
+        is_known = self.context.camera.hypothesis is None
+        return self.is_plain or (is_known and (not self.is_open or shows_little(self.context)))
+
+    @property
+    def shows_little(self) -> bool:
+        """Whether there are too few packets to find the clock, or packets leave their length open."""
+        return shows_little(self.context) or (self.framing is not None and self.framing.length < SETTINGS.sure_framing)
+
+    @property
+    def needs_surer_camera(self) -> bool:
+        """Whether the camera may be that of another frame."""
+        return self.camera_error == np.inf or (self.camera_error > 0 and self.shows_little)
 
     def with_surer_camera(self, located: Located | Failure) -> Located:
         """The same with the camera of another frame, if that camera is more precise."""
@@ -100,8 +109,7 @@ class Acquired:
     context: FrameContext
     acquisition: Acquisition
     initial: Reception
-    #: All screens that the camera may have seen.
-    screens: tuple[ScreenProfile, ...]
+    framing: Framing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,9 +143,7 @@ class ClipCamera:
         if found.outline is None or context is None:
             assert isinstance(found, Failure)
             return found
-        framing = 1.0
-        if isinstance(found, Found):
-            framing = framing_of(found.best.acquisition, found.best.reception, found.screens).length
+        framing = _framing_of(found) if isinstance(found, Found) else None
         context = replace(context, cache=cache, sampled_corners=found.outline.corners)
         return Located(found.outline, context, found, framing)
 
@@ -177,7 +183,8 @@ class ClipCamera:
         camera = replace(self, context=context)
         predicted = None if start is None else acquisition_at(start, replace(context, cache=located.context.cache))
         if predicted is not None:
-            return camera, Acquired(context, predicted, initial_pass(predicted), self.options.screens)
+            initial = initial_pass(predicted)
+            return camera, Acquired(context, predicted, initial, framing_of(predicted, initial, self.options.screens))
         # Of the camera's lens, and in no need of refinement.
         outline = replace(located.outline, corners=corners, strips=None, grid=None)
         found = located.found or search(cache, self.options, context, outlines=[outline])
@@ -189,7 +196,9 @@ class ClipCamera:
         if best.context.camera.hypothesis is not None:
             context = replace(best.context, cache=cache, camera=replace(best.context.camera, hypothesis=None))
         context = replace(context, sampled_corners=best.context.sampled_corners)
-        return replace(camera, context=context), Acquired(context, best.acquisition, best.reception, found.screens)
+        framing = located.framing if found is located.found else None
+        acquired = Acquired(context, best.acquisition, best.reception, framing or _framing_of(found))
+        return replace(camera, context=context), acquired
 
     def _compared(self, found: Found, outline: Outline) -> tuple[ClipCamera, Found]:
         """Estimate the camera of a clip's first frame where that of the profile explains little of it.
@@ -207,6 +216,10 @@ class ClipCamera:
             return compared, found
         stretch = context.camera.line_delay_s / estimated.best.context.camera.line_delay_s
         return replace(compared, options=options, message=_UNLIKE.format(stretch)), estimated
+
+
+def _framing_of(found: Found) -> Framing:
+    return framing_of(found.best.acquisition, found.best.reception, found.screens)
 
 
 def _kind_of(frame: Frame) -> tuple[object, ...]:

@@ -151,7 +151,7 @@ class Ledger:
                 timeline.number(view)
                 self._add_bursts(view)
                 scene = self._scene  # The frames of the one before may still wait.
-                if scene is not None and view.flat is not None and scene.can_measure_again(view):
+                if scene is not None and view.tracked and scene.can_measure_again(view):
                     scene.update(view, partial(lit_slots, view, self._open(view)))
 
     def _add_bursts(self, view: View) -> None:

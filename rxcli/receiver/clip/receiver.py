@@ -14,7 +14,7 @@ import numpy as np
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
 from rxcli.protocol import SLOTS_PER_SYMBOL
-from rxcli.receiver.clip.acquiring import FirstFrames, HiddenFrames
+from rxcli.receiver.clip.acquiring import FirstFrames
 from rxcli.receiver.clip.camera import Acquired, ClipCamera, Located
 from rxcli.receiver.clip.common_clock import common_clock, start_by
 from rxcli.receiver.clip.ledger import Ledger
@@ -23,15 +23,13 @@ from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import JointSlots, View, Waiting, decides_jointly
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.frame.cache import FrameCache
-from rxcli.receiver.frame.passes import Reception, shows_steady_light
+from rxcli.receiver.frame.passes import shows_steady_light
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.light import slot_llr
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found
-from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode
-from rxcli.receiver.sync import tracking
 from rxcli.types import FloatArray, Frame, FrameResult, OnTaps
 
 _SAME = "it shows the frame before once more, so that its time is not that of its rows; it was left out"
@@ -75,7 +73,7 @@ class Acquiring:
     """No frame has been received: the first ones wait until they agree."""
 
     known: Known
-    frames: HiddenFrames | FirstFrames | None = None
+    frames: FirstFrames | None = None
     #: Whether frames that show nothing by themselves may wait for others.
     may_wait: bool = True
 
@@ -123,7 +121,7 @@ def _acquire(state: Acquiring, frame: Frame) -> tuple[State, list[FrameResult]]:
     """Take one of the first frames; they are received once they agree."""
     known, held = state.known, state.frames
     if held is None:
-        return _go_on(known, HiddenFrames.begin(frame, known.camera, may_wait=state.may_wait))
+        return _go_on(known, FirstFrames.begin(frame, known.camera, may_wait=state.may_wait))
     if _are_alike(held.frames[0], frame):
         return _go_on(known, held.with_frame(frame, known.camera))
     after, results = _received(state)
@@ -144,16 +142,15 @@ def _received(state: State) -> tuple[State, list[FrameResult]]:
     return state, results
 
 
-def _go_on(known: Known, held: HiddenFrames | FirstFrames, *, are_all: bool = False) -> tuple[State, list[FrameResult]]:
+def _go_on(known: Known, held: FirstFrames, *, are_all: bool = False) -> tuple[State, list[FrameResult]]:
     """Receive the first frames if they are enough; the first of them alone if it shows no screen and camera."""
-    if not (held.are_enough or are_all):
+    if len(held.frames) < held.n_needed and not are_all:
         return Acquiring(known, held), []
-    if isinstance(held, FirstFrames):
-        return _receive_first(known, held)
-    shown = held.shown(known.camera)
-    if isinstance(shown, FirstFrames):
-        return _go_on(known, shown, are_all=are_all)
-    after, results = _receive(Lost(known), held.frames[0], shown)
+    if held.is_hidden:
+        return _go_on(known, held.shown(known.camera), are_all=are_all)
+    if isinstance(held.located, Located):
+        return _receive_first(known, held, held.located)
+    after, results = _receive(Lost(known), held.frames[0], held.located)
     state: State = Acquiring(after.known, may_wait=False)
     for frame in held.frames[1:]:
         state, more = step(state, frame)
@@ -161,18 +158,19 @@ def _go_on(known: Known, held: HiddenFrames | FirstFrames, *, are_all: bool = Fa
     return replace(state, may_wait=True) if isinstance(state, Acquiring) else state, results
 
 
-def _receive_first(known: Known, held: FirstFrames) -> _Step:
-    """Receive the first frames, once they have agreed on an outline and, where each shows little, on a clock."""
-    located = held.agreed()
+def _receive_first(known: Known, held: FirstFrames, located: Located) -> _Step:
+    """Receive the first frames by what they show; where each shows little, they agree on a clock."""
     if held.start is not None:
         known.ledger.start = held.start
-    elif len(held.frames) > 1 and isinstance(found := held.located.found, Found) and _hides_headers(found):
+    elif len(held.frames) > 1 and isinstance(found := located.found, Found) and _hides_headers(found):
         known.ledger.start = start_by(found, held.frames)
-    elif len(held.frames) > 1 and held.shows_little:
+    elif len(held.frames) > 1 and located.shows_little:
         agreed = common_clock(held.frames, located.context, known.camera.options.screens)
         if agreed is not None:
             known.ledger.start, context = agreed
             located = replace(located, context=context)
+    if not (located.is_plain or located.is_long):
+        located = replace(located, found=None)  # Of few packets, a second search there finds clock and exposure better.
     after, results = _receive(Lost(known), held.frames[0], located)
     for frame in held.frames[1:]:
         after, more = _receive(after, frame)
@@ -277,30 +275,35 @@ def _receive_anew(
     known = replace(known, camera=camera, corners=located.outline.corners)
     if isinstance(acquired, Failure):
         return Lost(known), acquired, None
-    options, acquisition = camera.options, acquired.acquisition
+    options, acquisition, report = camera.options, acquired.acquisition, None
+    tracks, denoised = _can_track(acquired, options), frozenset[int]()
     is_joint = decides_jointly(acquired.initial.clock)
     with timer("detect"):
         reception = decode(acquisition, options.skip, acquired.initial, adds_up=not is_joint)
-    with timer("denoise"):
-        reception, denoised, report = apply_autoencoder(acquisition, reception, options)
+    if not tracks or options.cae == "always":  # Else further frames show the picture.
+        with timer("denoise"):
+            reception, denoised, report = apply_autoencoder(acquisition, reception, options)
     # Of long exposures packets were compared with arbitrary slots already.
     if ledger.start is None and not reception.is_long and shows_steady_light(reception):
         return Lost(known), Failure("no_signal", STEADY_LIGHT), None
     if assemble.all_dark(reception.snr):
         return Lost(known), Failure("no_signal", _NOTHING_LIT), None
     known = replace(known, outline=located.outline)
+    metrics = reception.metrics
+    if is_joint:
+        metrics = by_copy_metrics(np.asarray(0.5 + 0.5 * np.tanh(slot_llr(metrics) / 2), np.float32))
     view = View(
         acquired.context,
         acquisition,
-        _bursts_of(frame, reception),
-        1 if is_joint else reception.model.exposure.isi_memory,
-        frame.height,
+        reception.clock,
+        metrics,
+        np.minimum(assemble.slots_observed(reception.samples, reception.clock.by_copy), 1),
         reception.snr,
         denoised,
-        framing=framing_of(acquisition, acquired.initial, acquired.screens),
+        framing=acquired.framing,
         joint=JointSlots.of(reception.clock, reception.posteriors) if is_joint else None,
     )
-    if not _can_track(acquired, options):
+    if not tracks:
         return Lost(known), view, report
     with timer("sampling"):
         place = replace(acquired.context, sampled_corners=located.context.sampled_corners)
@@ -318,11 +321,3 @@ def _can_track(acquired: Acquired, options: ReceiverOptions) -> bool:
         and acquired.acquisition.profiles.sensor_row is None
         and not acquired.context.camera.reversed
     )
-
-
-def _bursts_of(frame: Frame, reception: Reception) -> tracking.FrameBursts:
-    shown = np.minimum(assemble.slots_observed(reception.samples, reception.clock.by_copy), 1)
-    metrics = reception.metrics
-    if decides_jointly(reception.clock):
-        metrics = by_copy_metrics(np.asarray(0.5 + 0.5 * np.tanh(slot_llr(metrics) / 2), np.float32))
-    return tracking.FrameBursts(frame.index, 0, reception.clock, metrics, shown)

@@ -39,21 +39,19 @@ class Reporter:
         result, view = waiting.result, waiting.view
         assert view is not None
         ended = [burst.ended(view) for burst in closed]
-        framing = np.ones(view.bursts.clock.n_copies)
+        framing = np.ones(view.clock.n_copies)
         for burst, end in zip(closed, ended, strict=True):
             framing[end.index] = timeline.certainty(burst.copies)
         headerless = timeline.headerless(ended, len(view.snr))
         columns = assemble.clip_results(
-            assemble.FrameColumns(
-                view.bursts.clock, view.snr, headerless, self.options.min_confidence, certainty, framing
-            ),
+            assemble.FrameColumns(view.clock, view.snr, headerless, self.options.min_confidence, certainty, framing),
             ended,
             lambda column: any(burst.probability(column) >= BELIEVABLE for burst in going_on),
         )
         if view.denoised:
             columns = tuple(replace(column, denoised=column.column in view.denoised) for column in columns)
         if view.context.camera.reversed:
-            columns = tuple(assemble.in_stored_rows(column, view.height) for column in columns)
+            columns = tuple(assemble.in_stored_rows(column, view.context.frame.height) for column in columns)
         if self.on_taps is not None:
             self.on_taps(result.source, result.frame, _taps(result, view, ended))
         soft = None
@@ -68,7 +66,7 @@ class Reporter:
 
 def _taps(result: FrameResult, view: View, ended: Sequence[BurstInView]) -> dict[str, Any]:
     """What is written of a frame: as of a photograph, but strips as tracking samples them, and bursts that end here."""
-    found: dict[str, Any] = {"geometry.corners": result.corners, "clock": view.bursts.clock}
+    found: dict[str, Any] = {"geometry.corners": result.corners, "clock": view.clock}
     found["geometry.sampled_corners"] = view.context.sampled_corners
     if view.light is not None and view.pose is not None:
         rows = view.pose.rows.astype(np.int64)
@@ -76,6 +74,6 @@ def _taps(result: FrameResult, view: View, ended: Sequence[BurstInView]) -> dict
     else:
         found["sampling"] = view.acquisition.profiles
     numbers: IntArray = np.array([burst.number for burst in ended], np.int64)
-    found |= {"channel.metrics": view.bursts.metrics, "bursts.shown": view.bursts.shown}
+    found |= {"channel.metrics": view.metrics, "bursts.shown": view.shown}
     found |= {"bursts.number": view.numbers, "bursts.ended": numbers}
     return found | {f"detect.{burst.number}": burst.posteriors for burst in ended}

@@ -9,7 +9,6 @@ from operator import itemgetter
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.profiles import ScreenProfile
 from rxcli.receiver import channel, plane
 from rxcli.receiver.channel import ObservationModel, SlotLikelihoods, known_picture
 from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
@@ -42,7 +41,7 @@ class TrackedScreen:
     def __init__(self, context: FrameContext, acquisition: Acquisition, model: ObservationModel, named: bool) -> None:
         frame, corners, tone = context.frame, context.sampled_corners, context.camera.tone
         self._lens, self._named, self._acquisition = context.camera.lens, named, acquisition
-        self._black_level = model.black_level
+        self._black_level, self._isi_memory = model.black_level, model.exposure.isi_memory
         column_px = float(np.linalg.norm(corners[1] - corners[0])) / acquisition.screen.columns
         self._n_strips = min(plane.strips_per_column(column_px), SETTINGS.max_strips)
         outlines, self._n_end_rows = self._outlines(frame, corners), SETTINGS.end_rows
@@ -114,27 +113,27 @@ class TrackedScreen:
         if clock is None:
             return None
         if decides_jointly(clock):
-            bursts, observed = timeline.assigned(frame, clock), _Observed(pose.rows, light, columns, 1)
+            bursts, observed = timeline.assigned(frame, clock), _Observed(pose.rows, light, columns)
             return self._long_view(cache, observed, picture, clock, bursts, max_misfit)
         with timer("detect"):
             positions = known_picture.row_positions(pose.rows, clock)
             lit = known_picture.first_decision(columns, positions, clock)
-            observed = _Observed(pose.rows, light, columns, last.isi_memory)
-            measured = _measured(picture, observed, clock, lit, max_misfit)
+            observed = _Observed(pose.rows, light, columns)
+            measured = self._measured(picture, observed, clock, lit, max_misfit)
             if measured is None:
                 return None
-            columns, clock, likelihoods = measured
+            clock, likelihoods = measured
             shown = _shown(pose.map.inside, known_picture.row_positions(pose.rows, clock), clock)
         return View(
             replace(last.context, cache=cache, sampled_corners=self.corners),
             replace(last.acquisition, clock=clock),
-            tracking.FrameBursts(frame.index, 0, clock, likelihoods.metrics, shown, tracked=True),
-            last.isi_memory,
-            frame.height,
+            clock,
+            likelihoods.metrics,
+            shown,
             likelihoods.snr,
             light=light,
             pose=pose,
-            flat=columns,
+            tracked=True,
         )
 
     def _long_view(
@@ -152,7 +151,7 @@ class TrackedScreen:
         """
         assert self.last is not None
         assert self.last.joint is not None
-        pose, frame = self.pose, cache.frame
+        pose = self.pose
         with cache.timer("detect"):
             acquisition = self._acquired(observed.light, pose, picture, clock)
             model, weights = self._model(clock), self.last.joint.w_log_prob
@@ -176,9 +175,9 @@ class TrackedScreen:
         view = View(
             replace(self.last.context, cache=cache, sampled_corners=self.corners),
             replace(self.last.acquisition, clock=clock),
-            tracking.FrameBursts(frame.index, 0, clock, metrics, shown),
-            observed.isi_memory,
-            frame.height,
+            clock,
+            metrics,
+            shown,
             snr,
             light=observed.light,
             pose=pose,
@@ -186,6 +185,30 @@ class TrackedScreen:
         )
         self.update(view, lambda: lit)
         return view
+
+    def _measured(
+        self, picture: PlacedPicture, observed: _Observed, clock: Clock, lit: Float32Array, max_misfit: float
+    ) -> tuple[Clock, SlotLikelihoods] | None:
+        """Correct clock, response and noise of a frame by its decided slots `lit` (C, N); then likelihoods.
+
+        None where the light does not fit the decisions: another scene, or something in front of the screen.
+        """
+        rows, columns, isi_memory = observed.rows, observed.columns, self._isi_memory
+        positions = known_picture.row_positions(rows, clock)
+        fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
+        if fit.centre < SETTINGS.faded:
+            expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit)
+            columns = picture.solve_again(observed.light, expected.light, clock.rows_per_slot)
+            fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
+        if abs(fit.late) > SETTINGS.late_slots:
+            clock = replace(clock, row0=clock.row0 - fit.late * clock.rows_per_slot)
+            positions = known_picture.row_positions(rows, clock)
+            fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
+        expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit)
+        judged = picture.judge(columns, expected.light, max_misfit, SETTINGS.frame_share, clock.rows_per_slot)
+        if judged is None:
+            return None
+        return clock, known_picture.slot_likelihoods(judged, expected, clock, isi_memory)
 
     def _acquired(self, light: Float32Array, pose: Pose, picture: PlacedPicture, clock: Clock) -> Acquisition:
         """Light of the strips with the picture as far as it is known, on a clock."""
@@ -303,7 +326,7 @@ class TrackedScreen:
         if view.light is None or view.pose is None:
             return None
         self._n_updates += 1
-        clock, pose, frame_row = view.bursts.clock, view.pose, None
+        clock, pose, frame_row = view.clock, view.pose, None
         positions = known_picture.row_positions(pose.rows, clock)
         slots, doubt = (SlotLight(p).mean_over(positions, clock.exposure_slots) for p in (lit, lit * (1 - lit)))
         trust = np.maximum(1 - SETTINGS.doubt_weight * doubt, 0)
@@ -337,7 +360,7 @@ class TrackedScreen:
         """Measure a frame by the picture, less what the frame itself has shown of it."""
         assert view.light is not None
         assert view.pose is not None
-        pose, clock = view.pose, view.bursts.clock
+        pose, clock = view.pose, view.clock
         picture = self._picture.without(own).placed(pose.map.inside, pose.picture_row)
         if view.joint is not None:
             acquisition = self._acquired(view.light, pose, picture, clock)
@@ -347,22 +370,11 @@ class TrackedScreen:
         columns = picture.solve(view.light)
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:
             return
-        observed = _Observed(pose.rows, view.light, columns, view.isi_memory)
-        measured = _measured(picture, observed, clock, known, SETTINGS.misfit)
+        observed = _Observed(pose.rows, view.light, columns)
+        measured = self._measured(picture, observed, clock, known, SETTINGS.misfit)
         if measured is not None:
-            view.flat, clock, found = measured
-            view.snr = found.snr
-            view.bursts = replace(view.bursts, clock=clock, metrics=found.metrics, tracked=True)
-
-
-def followed_outline(frame: Frame, corners: FloatArray, screen: ScreenProfile) -> FloatArray | None:
-    """Corners (4, 2) of a screen by its outline, which is looked for near `corners`; None if it is not there."""
-    from rxcli.receiver.screen.find import ColumnLayout, follow_outline
-
-    stored, order = _stored_order(corners)
-    layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
-    found = follow_outline(plane.read_plane(frame), stored, layout)
-    return None if found is None else found[order]
+            view.clock, likelihoods = measured
+            view.snr, view.metrics, view.tracked = likelihoods.snr, likelihoods.metrics, True
 
 
 @dataclass(frozen=True, slots=True)
@@ -373,38 +385,11 @@ class _Observed:
     rows: FloatArray
     light: Float32Array
     columns: ColumnLight
-    #: Number of earlier slots that influence the light of a slot.
-    isi_memory: int
 
 
 def by_copy_metrics(lit: Float32Array) -> FloatArray:
     """Metrics of slots (C, N) of a long exposure: some are wrong, however sure."""
     return channel.metrics_of(llr_of(0.5 + (1 - 2 * np.float32(SETTINGS.wrong_slots)) * (lit - 0.5)), 1)
-
-
-def _measured(
-    picture: PlacedPicture, observed: _Observed, clock: Clock, lit: Float32Array, max_misfit: float
-) -> tuple[ColumnLight, Clock, SlotLikelihoods] | None:
-    """Correct clock, response and noise of a frame by its decided slots `lit` (C, N); then likelihoods.
-
-    None where the light does not fit the decisions: another scene, or something in front of the screen.
-    """
-    rows, columns, isi_memory = observed.rows, observed.columns, observed.isi_memory
-    positions = known_picture.row_positions(rows, clock)
-    fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
-    if fit.centre < SETTINGS.faded:
-        expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit)
-        columns = picture.solve_again(observed.light, expected.light, clock.rows_per_slot)
-        fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
-    if abs(fit.late) > SETTINGS.late_slots:
-        clock = replace(clock, row0=clock.row0 - fit.late * clock.rows_per_slot)
-        positions = known_picture.row_positions(rows, clock)
-        fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
-    expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit)
-    judged = picture.judge(columns, expected.light, max_misfit, SETTINGS.frame_share, clock.rows_per_slot)
-    if judged is None:
-        return None
-    return judged, clock, known_picture.slot_likelihoods(judged, expected, clock, isi_memory)
 
 
 def _header_contrast(columns: ColumnLight, rows: FloatArray, clock: Clock) -> float:
@@ -427,15 +412,6 @@ def _shown(inside: BoolArray, positions: FloatArray, clock: Clock) -> IntArray:
     middles = np.arange(clock.n_slots) + 0.5
     shown = (middles >= start) & (middles <= end) & np.asarray(on_screen.any(axis=1))[:, None]
     return np.asarray(clock.to_copies(shown.astype(np.float32)), np.int64).transpose(1, 0, 2)
-
-
-def _stored_order(corners: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Corners clockwise from the one of smallest x + y, and the order that turns such ones back."""
-    following = np.roll(corners, -1, axis=0)
-    area = float((corners[:, 0] * following[:, 1] - following[:, 0] * corners[:, 1]).sum())
-    order = np.arange(4) if area > 0 else np.arange(4)[::-1]
-    order = np.roll(order, -int(corners[order].sum(axis=1).argmin()))
-    return corners[order], np.argsort(order)
 
 
 def _is_still(moved: FloatArray, sd_px: float) -> bool:

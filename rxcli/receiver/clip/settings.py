@@ -55,10 +55,8 @@ class ClipSettings(msgspec.Struct, frozen=True):
     #: these agree.
     searched_frames: tuple[float, ...] = (0.0, 0.5, 1.0, 0.25, 0.75, 0.125)
     few_frames: int = 2
-    #: First frames whose outlines are compared. First frames that are taken together: for the clock where each shows
-    #: little, for the phase of the bursts and for the picture; number where these leave doubt; and share of well lit
-    #: packets in doubt.
-    n_outlines: int = 5
+    #: First frames that are taken together: for the clock where each shows little, for the phase of the bursts and for
+    #: the picture; number where these leave doubt; and share of well lit packets in doubt.
     first_frames: int = 6
     frames_in_doubt: int = 24
     much_doubt: float = 0.03

@@ -71,9 +71,9 @@ class Timeline:
         """
         if self.shape != _shape(view):
             return False
-        frame, own = view.context.frame, view.bursts
+        frame = view.context.frame
         by_chance = 2 * self.time.sure_slots / self.time.packet_slots if self.time.is_measured else None
-        first_copy = self.time.update(frame.index, frame.time_s, own.clock)
+        first_copy = self.time.update(frame.index, frame.time_s, view.clock)
         if by_chance is not None:
             wrong = SETTINGS.wrong_clocks
             ratio = wrong / (1 - by_chance) if first_copy is None else (1 - wrong) / by_chance
@@ -81,18 +81,17 @@ class Timeline:
         if first_copy is None:
             return False
         self.length_log_odds += 0.0 if view.framing is None else view.framing.gain
-        view.bursts, self.last_time_s = replace(own, first_copy=first_copy), frame.time_s
+        view.first_copy, self.last_time_s = first_copy, frame.time_s
         if not self.phase.settled:
-            copies = own.clock.to_copies(slot_llr(own.metrics)).transpose(1, 0, 2)
-            self.phase.update(first_copy, np.asarray(copies * (own.shown > 0), np.float64))
+            copies = view.clock.to_copies(slot_llr(view.metrics)).transpose(1, 0, 2)
+            self.phase.update(first_copy, np.asarray(copies * (view.shown > 0), np.float64))
         return True
 
     def number(self, view: View) -> None:
         """Number the bursts of a frame."""
-        clock = view.bursts.clock
-        bursts = self.phase.burst_of(view.bursts.first_copy + np.arange(clock.n_copies))
+        bursts = self.phase.burst_of(view.first_copy + np.arange(view.clock.n_copies))
         numbers = np.unique(bursts)
-        view.bursts = replace(view.bursts, clock=replace(clock, burst=bursts - numbers[0]))
+        view.clock = replace(view.clock, burst=bursts - numbers[0])
         view.numbers = numbers + self.offset
         self.next_number = max(self.next_number, int(view.numbers[-1]) + 1)
 
@@ -125,7 +124,7 @@ class Timeline:
         """
         self.stamps_judged = True
         shown = np.flatnonzero(view.acquisition.profiles.inside.any(axis=(0, 1)))
-        readout_slots = float(np.ptp(shown)) / view.bursts.clock.rows_per_slot
+        readout_slots = float(np.ptp(shown)) / view.clock.rows_per_slot
         return self.time.time_stamp_stretch(readout_slots / self.time.slot_rate_hz)
 
     def headerless(self, closed: Sequence[confidence.BurstInView], n_columns: int) -> BoolArray:
@@ -137,4 +136,4 @@ class Timeline:
 
 
 def _shape(view: View) -> tuple[int, ...]:
-    return view.acquisition.screen.columns, view.bursts.clock.packet_slots, view.bursts.metrics.shape[-1]
+    return view.acquisition.screen.columns, view.clock.packet_slots, view.metrics.shape[-1]

@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from rxcli.receiver.channel.known_picture import ColumnLight
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.search.framing import Framing
-from rxcli.receiver.sync.tracking import FrameBursts
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, FrameResult, IntArray
 
 
@@ -56,13 +54,15 @@ class JointSlots:
 
 @dataclass(slots=True, eq=False)
 class View:
-    """A frame with a lock."""
+    """What a frame shows."""
 
     context: FrameContext
     acquisition: Acquisition
-    bursts: FrameBursts
-    isi_memory: int
-    height: int
+    clock: Clock
+    #: (C, N + memory, patterns).
+    metrics: FloatArray
+    #: (n_copies, C, packet) int: 1 where the slot is on the screen and in the picture.
+    shown: IntArray
     #: (C, N) squared contrast over variance of every slot; (C, 1) of a tracked frame.
     snr: Float32Array
     #: Columns that the auto-encoder changed.
@@ -71,8 +71,10 @@ class View:
     light: Float32Array | None = None
     #: Where the strips were then.
     pose: Pose | None = None
-    #: The columns' own light; None where the frame was received like a photograph.
-    flat: ColumnLight | None = None
+    #: Whether the picture was known from other frames.
+    tracked: bool = False
+    #: Number of the frame's copy 0 in the clip.
+    first_copy: int = 0
     #: Of a long exposure; the metrics are then those of every copy by itself.
     joint: JointSlots | None = None
     #: How sure the length of packets is by this frame alone; None where the picture was known.

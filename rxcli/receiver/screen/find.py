@@ -167,27 +167,6 @@ def thinned(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white:
     return np.asarray((pixels[*steps] - np.float32(black)) / (white - black), np.float32)
 
 
-def follow_outline(plane: LightPlane, corners: FloatArray, layout: ColumnLayout) -> FloatArray | None:
-    """Outline of a screen close to that of the frame before, or None if it is not found there.
-
-    Args:
-        plane: of the picture.
-        corners: (4, 2) of the frame before, clockwise from the screen's top left in the stored picture.
-        layout: of the screen's columns.
-    """
-    if min(plane.width, plane.height) < MIN_SIZE_PX:
-        return None
-    strips = read_strips(plane, n_parts=_PARTS if layout.is_narrow else 1)
-    n, start = layout.n_columns, grid_between(corners, layout.n_columns, (plane.width, plane.height), None)
-    grid = moved_by_waveforms(strips, start, layout.sigma, _FIRST_STEPS + _LAST_STEPS)
-    grid = with_light(strips, grid, layout.sigma)
-    if not _stands_out(strips, grid):
-        return None
-    light = predicted_light(strips, columns_at(grid.coefficients, strips.x, strips.y), layout.sigma)
-    flat, ends, has_bars = find_rows(strips, light, grid, n, layout.aspect)
-    return flat.corners(flat.ends_of(corners) if has_bars else ends)  # With bars the rows are where they were.
-
-
 def wide_grids(strips: PictureStrips, sigma: float, rivals: Sequence[Grid] = (), least: float = 1.0) -> list[Grid]:
     """The grid of wide columns that explains the strips' light best, and one that does nearly as well, if any.
 

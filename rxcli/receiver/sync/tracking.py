@@ -232,19 +232,3 @@ class BurstPhase:
         repeats, phases = self._hypotheses.T
         same = (copy_a + phases) // repeats == (copy_b + phases) // repeats
         self._score += np.where(same, llr / 2, -llr / 2)
-
-
-@dataclass(frozen=True, slots=True)
-class FrameBursts:
-    """The bursts visible in a frame."""
-
-    frame: int
-    #: Number of the frame's copy 0 in the clip.
-    first_copy: int
-    clock: Clock
-    #: (C, N + memory, patterns).
-    metrics: FloatArray
-    #: (n_copies, C, packet) int: 1 where the slot is on the screen and in the picture.
-    shown: IntArray
-    #: Whether the picture was known from other frames.
-    tracked: bool = False

@@ -16,7 +16,6 @@ from rxcli.receiver.screen.combs import find_combs
 from rxcli.receiver.screen.find import (
     ColumnLayout,
     find_screens,
-    follow_outline,
     why_useless,
     wide_grids,
 )
@@ -509,18 +508,6 @@ def test_plain_columns_are_told_from_none() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
     assert not find_screens(plane_of(noise), [WIDE])
     assert not find_screens(plane_of(noise[:16, :16]), [WIDE])
-
-
-def test_a_screen_that_moved_a_little_is_followed_and_a_lost_one_is_noticed() -> None:
-    before = CORNERS + np.array([6.0, -4.0])
-    followed = follow_outline(drawn("blobs"), before, WIDE)
-    assert followed is not None
-    np.testing.assert_allclose(followed, CORNERS, atol=16)
-    barred = follow_outline(drawn("letterbox"), before, WIDE)
-    np.testing.assert_allclose(barred[:, 1], before[:, 1], atol=16)
-    assert follow_outline(plane_of(np.zeros((HEIGHT, WIDTH), np.uint8)), before, WIDE) is None
-    noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), dtype=np.uint8)
-    assert follow_outline(plane_of(noise), before, WIDE) is None
 
 
 def without_screen(name: str) -> NDArray[Any]:
