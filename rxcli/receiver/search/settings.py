@@ -23,8 +23,9 @@ class SearchSettings(msgspec.Struct, frozen=True):
     doubtful_budget: int = 3
     borderless_budget: int = 12
     hopeless_budget: int = 8
-    #: Evidence of a screen without borders, times that of doubtful columns, from which it is taken instead.
-    borderless_gain: float = 2.0
+    #: Evidence of a screen without borders, or of an exposure that is not the stated one, times that of what was found
+    #: with them, from which it is taken instead.
+    min_gain: float = 2.0
     #: Siblings of a scored hypothesis get a pass if their score could come this near to the best one; log-odds within
     #: which an outline is possible.
     reach: float = 3.0

@@ -165,15 +165,14 @@ def test_scores_by_the_bright_columns_compare_with_those_by_all() -> None:
 
 
 @pytest.mark.parametrize(
-    ("exposure_slots", "evidence", "least", "measured"),
+    ("exposure_slots", "measured"),
     [
-        pytest.param(4.0, 1.0, 0.0, ["middle"] * 3, id="long exposures, until three were in vain"),
-        pytest.param(1.0, 1.0, 0.0, ["all", *["middle", "all"] * 4], id="short exposures"),
-        pytest.param(1.0, 100.0, 300.0, ["all", *["middle"] * 4], id="not all if more evidence is needed"),
+        pytest.param(4.0, ["middle"] * 3, id="long exposures, until three were in vain"),
+        pytest.param(1.0, ["all", *["middle", "all"] * 4], id="short exposures"),
     ],
 )
 def test_hypotheses_are_measured_on_their_bright_columns_first(
-    exposure_slots: float, evidence: float, least: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
+    exposure_slots: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock, own = SimpleNamespace(exposure_slots=exposure_slots), list[str]()
     middle = SimpleNamespace(part="middle")
@@ -181,7 +180,7 @@ def test_hypotheses_are_measured_on_their_bright_columns_first(
 
     def measure(_: object, __: object, acquisition: Any) -> Any:
         own.append(acquisition.part)
-        return SimpleNamespace(score=0.0, evidence=evidence, reception=None)
+        return SimpleNamespace(score=0.0, evidence=1.0, reception=None)
 
     monkeypatch.setitem(_Walk.run.__globals__, "_acquired", lambda _: acquisition)
     monkeypatch.setattr(_Walk, "_measured", measure)
@@ -190,10 +189,20 @@ def test_hypotheses_are_measured_on_their_bright_columns_first(
     monkeypatch.setitem(_Walk.run.__globals__, "_in_likeliest_bursts", lambda scored: scored)
     monkeypatch.setitem(_Walk.run.__globals__, "evidence", SimpleNamespace(bright_score=lambda _: 0.0))
     proposer: Any = SimpleNamespace(siblings=lambda _: (), cameras=lambda: None)
-    walk = _Walk(proposer, 8, least)
+    walk = _Walk(proposer, 8)
     for _ in range(5):
         walk._score(estimated)
     assert own == measured
+
+
+@pytest.mark.parametrize(("stated", "n_proposed"), [(1.2, 0), (10.0, 1), (0.1, 1)])
+def test_where_a_stated_exposure_is_doubted_others_are_proposed(stated: float, n_proposed: int) -> None:
+    trial = trial_of("paper-17k3")
+    cache = FrameCache(replace(trial.frame, metadata=Metadata()))
+    own, options = Proposer(cache, ReceiverOptions(cameras=()), (Outline(trial.corners),)), ReceiverOptions(cameras=())
+    camera = next(own.cameras())[0].camera
+    doubting = Proposer(cache, options, own.outlines, doubted_s=stated * camera.exposure_s)
+    assert (len(doubting._of_camera(camera, 0.0)) > 0) == n_proposed
 
 
 @pytest.mark.parametrize("is_long", [True, False])
