@@ -50,8 +50,6 @@ _POSSIBLE_CONTRAST = 0.5
 _NEARLY_BEST, _SECOND, _DIFFERENT = 0.3, -25.0, 0.2
 #: Log-odds relative to the likeliest first column down to which another one is possible.
 _MIN_LOG_ODDS = -7.0
-#: JPEG codes blocks of pixels, whose borders look like those of narrow columns: their width, and its tolerance.
-_BLOCK_PX, _BLOCK_TOLERANCE_PX = 8.0, 0.1
 #: Number of unlit columns at a side from which the side counts as not visible.
 _UNLIT_COLUMNS = 0.5
 
@@ -228,8 +226,7 @@ def narrow_grid(strips: PictureStrips, sigma: float) -> Grid | None:
         for comb in find_combs(strips.part(part))[:1]:
             own = few.part(part)
             grid = moved_by_waveforms(own, grid_of_comb(comb, strips.part(part)), sigma, _FIRST_STEPS)
-            is_block = abs(grid.pitch_px - _BLOCK_PX) < _BLOCK_TOLERANCE_PX
-            if is_block or not _stands_out(own, with_light(own, grid, sigma)):
+            if not _stands_out(own, with_light(own, grid, sigma)):
                 continue
             grid = with_light(some, _followed(some, grid, float(own.raw_x.mean()), sigma), sigma)
             if _stands_out(some, grid):

@@ -38,11 +38,6 @@ class Grid:
     contrast: float = 0.0
 
     @property
-    def pitch_px(self) -> float:
-        """Width of a column at the picture's middle, pixels."""
-        return float(self.width / self.coefficients[1])
-
-    @property
     def estimated_lens(self) -> Lens | None:
         """Lens with the estimated radial coefficient, or None if the lens is known."""
         if self.lens is not None:

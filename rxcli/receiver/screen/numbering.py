@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-import msgspec
 import numpy as np
 
 from rxcli.numerics import TINY
@@ -38,36 +37,19 @@ _SIDE_SD = 0.0125
 _PAIRED = (0.22, 0.58)
 
 
-class _Weights(msgspec.Struct, frozen=True):
-    """Log-odds by feature of a first column; the comments in `models/numbering/model.toml` explain them."""
-
-    lit_inside: float
-    unlit_inside: float
-    steady_inside: float
-    light_off_middle: float
-    picture_off_middle: float
-    hidden_unlit: float
-    columns_on_border: float
-    light_on_border: float
-    faint_on_border: float
-    paired_edges: float
-    part_between: float
-
-
-class _Model(msgspec.Struct, frozen=True):
-    weights: _Weights
-
-
-#: Names of the weights, in the order of the features.
-WEIGHTS = _Weights.__struct_fields__
+#: Features of a first column in their order; the comments in `models/numbering/model.toml` explain them.
+WEIGHTS = (
+    *("lit_inside", "unlit_inside", "steady_inside", "light_off_middle", "picture_off_middle", "hidden_unlit"),
+    *("columns_on_border", "light_on_border", "faint_on_border", "paired_edges", "part_between"),
+)
 
 
 @lru_cache(maxsize=1)
 def numbering_weights() -> FloatArray:
-    """(11,) the shipped weights, in the order of the features."""
+    """(11,) the shipped weights, log-odds, in the order of the features."""
     path = data_dir("models") / "numbering" / "model.toml"
-    model = msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), _Model)
-    return np.array(msgspec.structs.astuple(model.weights))
+    weights = tomllib.loads(path.read_text(encoding="utf-8"))["weights"]
+    return np.array([weights[name] for name in WEIGHTS])
 
 
 @dataclass(frozen=True, slots=True)

@@ -120,7 +120,7 @@ def _slots_by(context: FrameContext) -> Iterator[_Slots]:
     found = [slots for by_exposure in _exposures(context) for slots in _at_likeliest_phase(by_exposure)]
     if found:
         found.sort(key=lambda slots: -slots.log_evidence)
-        likely = [slots for slots in found if slots.log_evidence > found[0].log_evidence - SETTINGS.cut_rate]
+        likely = [slots for slots in found if slots.log_evidence > found[0].log_evidence - SETTINGS.cut_reach]
         screens = tuple(screen for slots in likely for screen in slots.screens)
         yield replace(found[0], context=replace(found[0].context, screens=screens), screens=screens)
 
@@ -234,7 +234,7 @@ def _candidates(slots: _Slots) -> Iterator[_Candidate]:
 def _header_fit(initial: Reception, first_slot: int, packet_slots: int) -> float:
     """How well the header fits where packets of some length begin elsewhere."""
     bursts = channel.by_burst(initial.metrics, _started(initial.clock, first_slot, packet_slots))
-    return float(np.maximum(detect.header_llr(bursts).sum(axis=0), SETTINGS.worst_fit).sum())
+    return float(np.maximum(detect.header_llr(bursts).sum(axis=0), -SETTINGS.cut_start).sum())
 
 
 def _fit(initial: Reception, free: FloatArray, first_slot: int, packet_slots: int) -> float:

@@ -24,7 +24,7 @@ def log_evidence(reception: Reception) -> float:
 def fit(reception: Reception) -> float:
     """How well packets fit, for clocks whose slots are the same: in poor light all columns together show the start."""
     llr = reception.column_llr
-    return USUAL_COLUMNS / llr.size * float(np.maximum(llr, SETTINGS.worst_fit).sum())
+    return USUAL_COLUMNS / llr.size * float(np.maximum(llr, -SETTINGS.cut_start).sum())
 
 
 def score(reception: Reception, evidence: float, log_prior: float) -> float:

@@ -41,7 +41,6 @@ def search(
     known: FrameContext | None = None,
     *,
     outlines: list[Outline] | None = None,
-    budget: int = SETTINGS.budget,
     may_bend: bool = True,
 ) -> Found | Failure:
     """Find outline, rows, camera, screen, clock and bursts of a frame.
@@ -51,7 +50,6 @@ def search(
         options: screens, cameras, and corners if given.
         known: context of a frame of the same camera, if the camera and the screens are known.
         outlines: of the screen to receive; those of the clearest one in the picture if left out.
-        budget: maximum number of initial passes.
         may_bend: whether an unknown camera may have taken a distortion out, so that stripes are bent.
     """
     if outlines is None:
@@ -59,19 +57,15 @@ def search(
         if isinstance(screens, Failure):
             return screens
         outlines = screens[0]
-    found = _believing(cache, options, known, outlines, budget, may_bend)
-    packets, metadata = _packet_evidence(found), cache.frame.metadata
-    # Long exposures explain the light of short ones to some extent.
-    is_long = isinstance(found, Found) and found.best.reception.is_long
-    is_doubtful = packets < (SETTINGS.plain if is_long else SETTINGS.plain_estimate)
-    is_doubtful &= bool(found.tried) and not _is_steady(found)
-    if not is_doubtful or known or not metadata.exposure_s or known_camera(cache.frame, options) is not None:
+    found = _believing(cache, options, known, outlines, may_bend)
+    packets, stated = _packet_evidence(found), cache.frame.metadata
+    is_doubtful = packets < SETTINGS.plain_estimate and found.tried and not _is_steady(found)
+    if not is_doubtful or known or not stated.exposure_s or known_camera(cache.frame, options) is not None:
         return found
-    stated_s = metadata.exposure_s
-    doubts = (*metadata.not_believed, f"the stated exposure ({1e6 * stated_s:.0f} us)")
-    doubting = cache.with_metadata(replace(metadata, exposure_s=None, not_believed=doubts))
-    otherwise = _search(Proposer(doubting, options, tuple(outlines), None, may_bend, stated_s), budget)
-    min_evidence = max(SETTINGS.plain_estimate, packets * (1 if is_long else SETTINGS.min_gain))
+    doubts = (*stated.not_believed, f"the stated exposure ({1e6 * stated.exposure_s:.0f} us)")
+    doubting = cache.with_metadata(replace(stated, exposure_s=None, not_believed=doubts))
+    otherwise = _search(Proposer(doubting, options, tuple(outlines), None, may_bend, stated.exposure_s))
+    min_evidence = max(SETTINGS.plain_estimate, SETTINGS.min_gain * packets)
     return otherwise if _packet_evidence(otherwise) > min_evidence else found
 
 
@@ -80,13 +74,12 @@ def _believing(
     options: ReceiverOptions,
     known: FrameContext | None,
     outlines: list[Outline],
-    budget: int,
     may_bend: bool,
 ) -> Found | Failure:
     """`search` with the exposure that the file states, among columns with borders or without."""
 
     def search_among(some: list[Outline], known: FrameContext | None) -> Found | Failure:
-        return _search(Proposer(cache, options, tuple(some), known, may_bend), budget)
+        return _search(Proposer(cache, options, tuple(some), known, may_bend))
 
     found = search_among(outlines, known)
     packets = _packet_evidence(found)
@@ -114,15 +107,16 @@ def _packet_evidence(found: Found | Failure) -> float:
     """Evidence of what was found, or 0 if it shows no packets."""
     if isinstance(found, Failure) or found.best.evidence < SETTINGS.few_packets:
         return 0.0
-    return found.best.evidence
+    # Long exposures explain the light of short ones to some extent.
+    share = SETTINGS.plain_estimate / SETTINGS.plain if found.best.reception.is_long else 1.0
+    return share * found.best.evidence
 
 
-def _search(proposer: Proposer, budget: int) -> Found | Failure:
+def _search(proposer: Proposer) -> Found | Failure:
     """`search` among what is proposed."""
     outlines = proposer.outlines
-    if not outlines[0].stands_out:
-        budget = SETTINGS.borderless_budget if outlines[0].family < 0 else SETTINGS.doubtful_budget
-    walk = _Walk(proposer, budget)
+    is_doubtful = not outlines[0].stands_out and outlines[0].family >= 0
+    walk = _Walk(proposer, SETTINGS.doubtful_budget if is_doubtful else SETTINGS.budget)
     best = walk.run()
     min_evidence = (
         PASSES.min_packets_llr if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
@@ -277,7 +271,7 @@ class _Walk:
         is_costly = hypothesis.camera.hypothesis is not None and acquisition.clock.exposure_slots > LONG_EXPOSURE_SLOTS
         if is_costly and self._n_in_vain >= SETTINGS.doubtful_budget:
             return
-        if (best is not None or is_costly) and hypothesis.screen.columns > SETTINGS.few_columns:
+        if best is not None or is_costly:
             half = self._measured(hypothesis, acquisition.of_columns(acquisition.bright_columns))
             min_score, min_evidence, lead = -np.inf, PASSES.min_packets_llr, 0.0
             if best is not None:

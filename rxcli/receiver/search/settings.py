@@ -18,10 +18,9 @@ class SearchSettings(msgspec.Struct, frozen=True):
     few_packets: float = 40.0
     plain_estimate: float = 100.0
     #: Maximum number of initial passes of a frame; if its columns do not stand out, and of unknown cameras' long
-    #: exposures, which take long, without evidence; if it shows no borders of columns; of all without evidence.
+    #: exposures, which take long, without evidence; of all without evidence.
     budget: int = 24
     doubtful_budget: int = 3
-    borderless_budget: int = 12
     hopeless_budget: int = 8
     #: Evidence of a screen without borders, or of an exposure that is not the stated one, times that of what was found
     #: with them, from which it is taken instead.
@@ -29,8 +28,6 @@ class SearchSettings(msgspec.Struct, frozen=True):
     #: Siblings of a scored hypothesis get a pass if their score could come this near to the best one; log-odds within
     #: which an outline is possible.
     reach: float = 3.0
-    #: Number of columns up to which all are measured at once, not the brighter half first.
-    few_columns: int = 8
     #: Minimum header lead (peak over rival) of a clock.
     min_lead: float = 1.6
     #: Log prior lost by each further camera.
@@ -55,23 +52,20 @@ class SearchSettings(msgspec.Struct, frozen=True):
     #: Largest size of an outline relative to the picture, beyond which less than one column is visible.
     largest_outline: float = 50.0
 
-    #: Less than a packet in view: fewest symbols, phases of a slot that are tried, clocks that are handed on, fit by
-    #: which a start with a part of the header in view must lead, as one dark slot gives 14, and by which the last one
-    #: may be behind the first, least log-likelihood ratio of a column,
-    #: and least fit of a clock: noise has 20 times that of a column; fits of outline and camera; lead a slot below
-    #: which a camera profile may be wrong: by right ones pictures reach 22 to 51, by ones that are 1 % off 8 to 14.
+    #: Less than a packet in view: fewest symbols, phases of a slot that are tried, clocks that are handed on; fit by
+    #: which a start with a part of the header in view must lead, as one dark slot gives 14, and most that a column
+    #: takes off; least fit of a clock: noise has 20 times that of a column; fits of outline and camera; lead of a slot
+    #: below which a camera profile may be wrong: by right ones pictures reach 22 to 51, by ones 1 % off 8 to 14.
     cut_symbols: int = 2
     cut_phases: int = 4
     max_cut: int = 4
     cut_start: float = 60.0
-    cut_reach: float = 300.0
-    worst_fit: float = -60.0
     cut_fit: float = -1050.0
     cut_fits: int = 3
     poor_lead: float = 16.0
-    #: Log evidence by which one exposure of the slots excludes another: right ones lead by -2 to 2100 over half of it,
-    #: by 1300 and more over twice of it.
-    cut_rate: float = 300.0
+    #: Fit by which the last clock may be behind the first; and log evidence by which one exposure of the slots excludes
+    #: another: right ones lead by -2 to 2100 over half of it, by 1300 and more over twice of it.
+    cut_reach: float = 300.0
     #: Least log evidence of a slot against the unlikeliest phase: light without slots has 0.4, cut packets 18 and more.
     cut_lead: float = 1.0
     #: Room light that is tried where no header is in view, relative to its estimate, which counts what is lit in part.

@@ -311,20 +311,20 @@ def test_grids_compare_by_contrast_and_by_what_they_explain(
 ) -> None:
     strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
     rivals = [replace(true, coefficients=true.coefficients * np.array([1, by, 1, 1, 1, 1])) for by in (1, share)]
-    lights = {grid.pitch_px: light for grid, light in zip(rivals, (true_light, light), strict=True)}
+    lights = {grid.coefficients[1]: light for grid, light in zip(rivals, (true_light, light), strict=True)}
 
     def lit(_: PictureStrips, grid: Grid, __: float) -> Grid:
-        explained, contrast = lights[grid.pitch_px]
+        explained, contrast = lights[grid.coefficients[1]]
         return replace(grid, explained=explained, contrast=contrast)
 
     monkeypatch.setattr(find, "find_combs", lambda *_: rivals)
     monkeypatch.setattr(find, "grid_of_comb", lambda grid, _: replace(grid))
     monkeypatch.setattr(find, "moved_by_waveforms", lambda _, grid, *__: grid)
     monkeypatch.setattr(find, "with_light", lit)
-    proposed = [grid.pitch_px for grid in wide_grids(strips, 0.45)]
-    assert proposed == [grid.pitch_px for grid in rivals][:n_proposed]
+    proposed = [grid.coefficients[1] for grid in wide_grids(strips, 0.45)]
+    assert proposed == [grid.coefficients[1] for grid in rivals][:n_proposed]
     monkeypatch.setattr(find, "find_combs", lambda *_: rivals[:1])
-    assert wide_grids(strips, 0.45, rivals[1:])[0].pitch_px == rivals[share == 1.2].pitch_px
+    assert wide_grids(strips, 0.45, rivals[1:])[0].coefficients[1] == rivals[share == 1.2].coefficients[1]
 
 
 def test_combs_are_fitted_by_their_likelihood_as_borders_out_of_place_stand_out_little(
@@ -341,7 +341,7 @@ def test_combs_are_fitted_by_their_likelihood_as_borders_out_of_place_stand_out_
     monkeypatch.setattr(find, "grid_of_comb", lambda comb, _: comb)
     monkeypatch.setattr(find, "moved_by_waveforms", lambda _, grid, *__: replace(grid))
     monkeypatch.setattr(find, "with_light", lit)
-    assert wide_grids(strips, 0.45)[0].pitch_px == pytest.approx(true.pitch_px)
+    assert wide_grids(strips, 0.45)[0].coefficients[1] == pytest.approx(true.coefficients[1])
 
 
 def test_one_grid_over_a_dark_gap_is_one_screen(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -258,9 +258,9 @@ def test_a_refusal_says_what_came_nearest() -> None:
 
 def test_the_budget_bounds_the_passes() -> None:
     trial = trial_of("paper-17k3")
-    found = search(FrameCache(trial.frame), replace(trial.options(), screens=SHIPPED), budget=1)
-    assert isinstance(found, Found)
-    assert len(found.tried) == 1
+    options = replace(trial.options(), screens=SHIPPED)
+    walk = _Walk(Proposer(FrameCache(trial.frame), options, (Outline(trial.corners),)), 1)
+    assert len(walk.record(walk.run())) == 1
 
 
 @pytest.mark.parametrize(("exposure_slots", "n_sought"), [(1.5, 1), (3.0, 2)])
