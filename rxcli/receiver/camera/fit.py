@@ -64,7 +64,8 @@ def settle(
     values, covariance, near = model.fit(start, exposure, np.append(straight, bent) if may_bend else straight)
     # Four coefficients more have to explain more than chance does (Bayesian information criterion).
     n_independent = model.strips.light.size / SETTINGS.samples_per_independent
-    if may_bend and _chi_square(values[2:], covariance[2:, 2:]) < bent.size * np.log(n_independent):
+    chi_square = values[2:] @ np.linalg.solve(covariance[2:, 2:] + TINY * np.eye(bent.size), values[2:])
+    if may_bend and chi_square < bent.size * np.log(n_independent):
         values, covariance, near = model.fit(values * (np.arange(values.size) < 2), exposure, straight)
     if near.explained < SETTINGS.min_explained:
         return hypothesis, 0.0
@@ -85,10 +86,6 @@ def settle(
 def _turned(curvature: FloatArray, hypothesis: CameraHypothesis) -> FloatArray:
     """A bend with rows in the order of readout for one with rows as stored, or the other way round."""
     return curvature * np.array([1.0, 1.0, -1.0, 1.0]) if hypothesis.reversed else curvature
-
-
-def _chi_square(values: FloatArray, covariance: FloatArray) -> float:
-    return float(values @ np.linalg.solve(covariance + TINY * np.eye(values.size), values))
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,7 +36,11 @@ def burst_samples(
     mean = mean_of_valid(above, samples.valid, SLOTS_PER_SYMBOL * q) if samples.level is None else samples.level
     mean = np.maximum(mean, np.float32(SETTINGS.min_level_sigmas * model.noise.sigma))
     light = np.asarray(above / mean, np.float32)
-    own = own_light(light) if lit is None else light_through(exposed_from(clock.exposure_slots, q), lit)
+    if lit is None:  # Light over its mean lit light, in the middle strips.
+        third = light.shape[1] // 3
+        own = np.clip(light[:, third : light.shape[1] - third].mean(axis=1) / 2, 0, 1)
+    else:
+        own = light_through(exposed_from(clock.exposure_slots, q), lit)
     neighbours = model.crosstalk.from_neighbours(own, columns, clock.delay_slots * q)
     light, mean, valid = light[columns], mean[columns], samples.valid[columns]
     variance = model.noise.variance(above[columns]) / np.square(mean)
@@ -69,13 +73,6 @@ def _by_lane(values: NDArray[np.floating[Any]], clock: Clock, q: int) -> Float32
         for place, copy in enumerate(np.flatnonzero(clock.burst == burst)):
             out[:, :, burst, :, place] = by_copy[:, :, :, copy].transpose(3, 0, 1, 2)
     return out.reshape(clock.packet_slots, q, n_bursts * n_columns, most * n_strips)
-
-
-def own_light(light: Float32Array) -> Float32Array:
-    """(C, n) light of each column over its mean lit light, from the middle strips (C, S, n) relative to their mean."""
-    n_strips = light.shape[1]
-    third = n_strips // 3
-    return np.asarray(np.clip(light[:, third : n_strips - third].mean(axis=1) / 2, 0, 1), np.float32)
 
 
 def whole_light(lit: Float32Array, clock: Clock, crosstalk: Crosstalk, samples_per_slot: int) -> Float32Array:

@@ -120,13 +120,8 @@ def header_llr(metrics: FloatArray) -> FloatArray:
     isi_memory = _isi_memory_of(metrics)
     header = metrics[:, :, isi_memory : len(HEADER)]
     likelihood, top = _over_likeliest(header)
-    known = header[:, :, np.arange(len(HEADER) - isi_memory), _header_patterns(isi_memory)]
+    known = header[:, :, np.arange(len(HEADER) - isi_memory), _pattern_index(np.array(HEADER), isi_memory)]
     return np.asarray((known - top[..., 0] - np.log(likelihood.mean(axis=-1))).sum(axis=2))
-
-
-@cache
-def _header_patterns(isi_memory: int) -> NDArray[np.int64]:
-    return _pattern_index(np.array(HEADER), isi_memory)
 
 
 @dataclass(frozen=True, slots=True)

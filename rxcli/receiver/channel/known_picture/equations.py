@@ -33,13 +33,13 @@ class RowEquations:
         """Factor the equations of a picture (C, S, R), whose strips count with a `gain` of picture over variance."""
         left, own, right = crosstalk.T
         products = np.stack([own * own, left * left, right * right, own * right, left * own, left * right])
-        power = (products @ (gain * picture)).swapaxes(0, 1)
-        middle = power[0] + np.float32(SETTINGS.prior_precision)
-        middle[:-1] += power[1, 1:]
-        middle[1:] += power[2, :-1]
+        of_own, of_left, of_right, own_right, left_own, left_right = (products @ (gain * picture)).swapaxes(0, 1)
+        middle = of_own + np.float32(SETTINGS.prior_precision)
+        middle[:-1] += of_left[1:]
+        middle[1:] += of_right[:-1]
         beside, beyond = np.zeros_like(middle), np.zeros_like(middle)
-        beside[:-1] = power[3, :-1] + power[4, 1:]
-        beyond[:-2] = power[5, 1:-1]
+        beside[:-1] = own_right[:-1] + left_own[1:]
+        beyond[:-2] = left_right[1:-1]
         inverse, band_1, band_2, precision = _factored(middle, beside, beyond)
         precision = np.maximum(precision - np.float32(SETTINGS.prior_precision), 0)
         return cls(gain, crosstalk, inverse, band_1, band_2, precision)

@@ -51,4 +51,4 @@ def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) 
     if weight.sum() < SETTINGS.prior_precision * SETTINGS.min_header_rows:
         return 1.0
     weight = weight * np.sign(shape)
-    return float((weight * np.clip(2 * value - 1, -1.5, 1.5)).sum() / (weight * shape).sum())
+    return float((weight * np.clip(2 * value - 1, -2, 2)).sum() / (weight * shape).sum())

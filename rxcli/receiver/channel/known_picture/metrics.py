@@ -7,7 +7,6 @@ import numpy as np
 from rxcli.protocol import slot_patterns
 from rxcli.receiver.channel.known_picture.exposure import ExpectedLight, SlotView
 from rxcli.receiver.channel.known_picture.picture import ColumnLight
-from rxcli.receiver.channel.known_picture.settings import SETTINGS
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods
 from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
@@ -26,9 +25,9 @@ def slot_likelihoods(observed: ColumnLight, expected: ExpectedLight, clock: Cloc
         _row_metrics(value[group], observed.precision[group], view, clock.n_slots, isi_memory)
         for group, view in expected.views
     ]
-    # Squared contrast over variance of a slot is the precision of the rows around.
-    some = np.sort(observed.precision[:, :: SETTINGS.snr_every_row], axis=1)
-    snr = some[:, some.shape[1] // 2, None] * np.float32(clock.rows_per_slot)
+    # Squared contrast over variance of a slot is the precision of the rows around; a row of every slot shows it.
+    some = observed.precision[:, :: max(int(clock.rows_per_slot), 1)]
+    snr = np.median(some, axis=1, keepdims=True) * np.float32(clock.rows_per_slot)
     return SlotLikelihoods(np.concatenate(parts), snr)
 
 

@@ -14,6 +14,9 @@ from rxcli.receiver.channel.known_picture.settings import SETTINGS
 from rxcli.receiver.light import Crosstalk, NoiseModel
 from rxcli.types import BoolArray, Float32Array
 
+#: Information of light that almost nothing shows.
+_FAINT = np.float32(1e-3)
+
 
 @dataclass(frozen=True, slots=True)
 class ColumnLight:
@@ -188,17 +191,17 @@ class PlacedPicture:
         error = light - self.black_level - self.picture * (self.crosstalk @ _with_neighbours(expected))
         error *= error
         error *= self.inside
-        around = _around(error, rows_per_slot) / (_around(self.inside.astype(np.float32), rows_per_slot) + 1e-3)
+        around = _around(error, rows_per_slot) / (_around(self.inside.astype(np.float32), rows_per_slot) + _FAINT)
         gain = self.picture * self.inside / (self.variance + np.maximum(around, 0))
         return self._solved(light, RowEquations.of(self.picture, gain, self.crosstalk))
 
     def _solved(self, light: Float32Array, equations: RowEquations) -> ColumnLight:
         shrunk, precision = equations.solve(light - self.black_level), equations.precision
         prior = np.float32(SETTINGS.prior_precision)
-        value = shrunk + (shrunk - np.float32(0.5)) * (prior / np.maximum(precision, np.float32(1e-3)))
+        value = shrunk + (shrunk - np.float32(0.5)) * (prior / np.maximum(precision, _FAINT))
         # Precisions are reduced by the estimated noise of the columns; 0 where almost nothing is visible.
         tempered = precision / (self.excess[:, None] + np.float32(SETTINGS.common_error**2) * precision)
-        tempered[precision <= 1e-3] = 0
+        tempered[precision <= _FAINT] = 0
         return ColumnLight(np.asarray(value, np.float32), np.asarray(tempered, np.float32))
 
     def judge(

@@ -12,8 +12,8 @@ from rxcli.types import Float32Array, FloatArray
 #: Approximate number of values from which a response is fitted; and the golden ratio, whose multiples are spread evenly
 #: modulo 1.
 _SAMPLES_OF_RESPONSE, _GOLDEN = 2000, 0.6180339887
-#: (2, 4) lower and upper limits of centre, side, offset and lateness.
-_BOUNDS = np.transpose(SETTINGS.response_bounds)
+#: Centre, side, offset and lateness of a response without blur.
+_SHARP = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def fit_response(observed: ColumnLight, lit: Float32Array, positions: FloatArray, exposure_slots: float) -> Response:
@@ -39,8 +39,8 @@ def fit_response(observed: ColumnLight, lit: Float32Array, positions: FloatArray
     weighted = parts * precision
     weight = float(precision.sum()) + TINY
     normal, right = weighted @ parts.T / weight, weighted @ value / weight
+    most = np.array(SETTINGS.max_response)
     # Regularised towards no blur.
-    fitted = np.linalg.solve(normal + SETTINGS.response_ridge * np.eye(len(normal)), right - normal[:, 0])
-    fitted[0] += 1
-    fitted[3] /= max(fitted[0] + 2 * fitted[1], SETTINGS.response_bounds[0][0])
-    return Response(*np.clip(fitted, *_BOUNDS).tolist())
+    fitted = np.linalg.solve(normal + SETTINGS.response_ridge * np.eye(len(normal)), right - normal @ _SHARP)
+    fitted[-1] /= max(1 + fitted[0] + 2 * fitted[1], 1 - most[0])
+    return Response(*(_SHARP + np.clip(fitted, -most, most)).tolist())

@@ -38,9 +38,9 @@ class KnownPictureSettings(msgspec.Struct, frozen=True):
     mean_error_slots: float = 20.0
     min_correlated_error: float = 0.9
 
-    #: Limits of the centre, the side and the offset of a response, and of one correction of the clock in slots; and the
-    #: ridge of their fit.
-    response_bounds: tuple[tuple[float, float], ...] = ((0.3, 1.3), (-0.1, 0.35), (-0.2, 0.2), (-0.4, 0.4))
+    #: How far centre, side and offset of a response may be from those without blur, and a clock from the one that is
+    #: corrected, slots; and the ridge of their fit.
+    max_response: tuple[float, ...] = (0.7, 0.35, 0.2, 0.4)
     response_ridge: float = 1e-4
 
     #: Distance from the middle of a slot within which rows count for its first decision, slots.
@@ -50,9 +50,6 @@ class KnownPictureSettings(msgspec.Struct, frozen=True):
 
     #: Distance of the blur taps, slots.
     side_slots: float = 0.5
-
-    #: Row step for the signal-to-noise ratio of a column.
-    snr_every_row: int = 5
 
 
 SETTINGS = KnownPictureSettings()
