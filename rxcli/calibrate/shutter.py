@@ -309,8 +309,7 @@ def _doubts(result: ShutterCalibration, *, is_coded: bool) -> tuple[str, ...]:
     """Why the stripes may be none of a lamp, of a picture that may have been coded in blocks."""
     doubts = []
     if result.readout_s > _LONG_READOUT_S:
-        readout = f"a readout of {1e3 * result.readout_s:.0f} ms"
-        doubts.append(f"{readout} is longer than that of nearly all cameras: the stripes may be texture")
+        doubts.append(f"a readout of {1e3 * result.readout_s:.0f} ms is rare in cameras: the stripes may be texture")
     for lamp in result.lamps if is_coded else ():
         block = next((px for px in _BLOCKS_PX if abs(lamp.period_px / px - 1) < _SAME_PERIOD), None)
         if lamp.frequency_hz and block:
