@@ -91,13 +91,14 @@ def _best(context: FrameContext, outlines: Sequence[Outline]) -> Iterator[_Slots
 
 
 def _found(context: FrameContext, outlines: Sequence[Outline]) -> list[tuple[_Slots, Outline]]:
-    """The slots by every outline and camera, and the outline."""
-    return [
-        (slots, outline)
-        for outline in outlines
-        for by_camera in _cameras(replace(context, sampled_corners=outline.corners))
-        for slots in _slots_by(by_camera)
-    ]
+    """The slots by every outline and camera, and the outline; unlikelier cameras where none stands out."""
+    found: list[tuple[_Slots, Outline]] = []
+    for outline in outlines:
+        for by_camera in _cameras(replace(context, sampled_corners=outline.corners)):
+            found += [(slots, outline) for slots in _slots_by(by_camera)]
+            if by_camera.camera.hypothesis and found and found[-1][0].lead > SETTINGS.poor_lead:
+                break
+    return found
 
 
 def _cameras(context: FrameContext) -> Iterable[FrameContext]:

@@ -55,7 +55,7 @@ class SearchSettings(msgspec.Struct, frozen=True):
     #: Less than a packet in view: fewest symbols, phases of a slot that are tried, clocks that are handed on; fit by
     #: which a start with a part of the header in view must lead, as one dark slot gives 14, and most that a column
     #: takes off; least fit of a clock: noise has 20 times that of a column; fits of outline and camera; lead of a slot
-    #: below which a camera profile may be wrong: by right ones pictures reach 22 to 51, by ones 1 % off 8 to 14.
+    #: below which a camera may be wrong: by right ones pictures reach 22 to 69, by ones 1 % off 8 to 14.
     cut_symbols: int = 2
     cut_phases: int = 4
     max_cut: int = 4
