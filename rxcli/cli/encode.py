@@ -19,7 +19,7 @@ from rxcli.cli.kinds import FILE, POSITIVE
 from rxcli.cli.sending import LIGHT, raw_sending, sending_of
 from rxcli.errors import InputError, UsageError
 from rxcli.link.encoder import FileSending, Sending, TestLight, packet_slots_of, payload_hex, visible_bits_of_burst
-from rxcli.link.slots import WITHOUT_TEXT, WRITERS, bytes_per_row, order_of, write_slots
+from rxcli.link.slots import WITHOUT_TEXT, WRITERS, bytes_per_row, order_of
 from rxcli.outputs import ENCODED, TRUTH, claim, unwritable, write_whole
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import payload_bits
@@ -108,7 +108,7 @@ def _write_slots(plan: _Plan, out: Path, suffix: str) -> None:
     """Write slots in the format of a suffix; beside those without text a file that states rate and order."""
     screen, n_slots = plan.screen, plan.n_bursts * plan.burst_slots
     with click.open_file(str(out), "wb") as file:
-        write_slots(file, suffix, plan.slots(), n_slots, screen)
+        WRITERS[suffix](file, plan.slots(), n_slots, screen)
     if suffix in WITHOUT_TEXT:
         shape, bits = (n_slots, bytes_per_row(screen)), "column 0 is the most significant bit of the first byte"
         _readme_of(out).write_text(f"{out.name}: uint8 {shape}; {order_of(screen)}; {bits}.\n", encoding="utf-8")

@@ -24,7 +24,7 @@ from rxcli.lab.simulate.pictures import picture_names
 from rxcli.lab.simulate.scenes import PRESETS, Scene, preset, with_fields
 from rxcli.lab.simulate.transmitter import PICTURE_FILES, Weights, export_picture
 from rxcli.lab.simulate.truth import build_camera_profile, truth_path, write_truth
-from rxcli.link.slots import read_slots, write_slots
+from rxcli.link.slots import WRITERS, read_slots
 from rxcli.profiles import ScreenProfile, dump_profile
 
 _STILLS = ("jpeg", "dng", "dng14", "png", "png16", "tiff", "tiff16")
@@ -254,7 +254,7 @@ def _write_extras(capture: Recording, options: dict[str, Any]) -> None:
         n_slots, folder = n_bursts * capture.link.burst_slots, options["waveforms"]
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / _SLOT_FILE).open("wb") as file:
-            write_slots(file, ".csv", [capture.link.slots(0, n_slots).T], n_slots, capture.scene.screen)
+            WRITERS[".csv"](file, [capture.link.slots(0, n_slots).T], n_slots, capture.scene.screen)
         export_picture(capture.drive, folder)
 
 

@@ -84,7 +84,7 @@ def _time_ns(slot: int, screen: ScreenProfile) -> int:
     return round(slot * 1e9 / screen.slot_rate_hz)
 
 
-#: Writers by suffix.
+#: Writers by suffix. They take a file open for writing, chunks (n, C) uint8 of 0/1 in order, their sum of n, a screen.
 WRITERS: dict[str, _Write] = {
     ".csv": _write_csv,
     ".npy": _write_npy,
@@ -94,19 +94,6 @@ WRITERS: dict[str, _Write] = {
 }
 #: Formats that hold no text: rate and order stand in a file beside them.
 WITHOUT_TEXT = (".npy", ".bin")
-
-
-def write_slots(file: IO[bytes], suffix: str, chunks: Iterable[Slots], n_slots: int, screen: ScreenProfile) -> None:
-    """Write slots.
-
-    Args:
-        file: open for writing.
-        suffix: one of `WRITERS`.
-        chunks: (n, C) uint8 of 0/1, in order.
-        n_slots: of all chunks.
-        screen: that sends them.
-    """
-    WRITERS[suffix](file, chunks, n_slots, screen)
 
 
 def read_slots(path: Path, screen: ScreenProfile) -> Slots:

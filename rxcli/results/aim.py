@@ -20,17 +20,12 @@ _DARK, _BRIGHT, _WASHED_OUT = 0.06, 0.1, 0.4
 #: 1080), and share of the columns below which motion matters at all.
 _STILL, _FEW = 0.01, 0.5
 _CLOSER = "Move closer, until the screen fills the picture."
+_TURN = "Turn the camera, until its long side lies along the screen's."
 #: For those who aim: part of a message that was written for photos -> reason and next step.
 _AIMING = {
-    "in portrait": (
-        "The screen lies on its side in the picture.",
-        "Turn the camera, until its long side lies along the screen's.",
-    ),
+    "in portrait": ("The screen lies on its side in the picture.", _TURN),
     "only a part of": ("Only a part of the picture shows stripes.", _CLOSER),
-    "no columns of": (
-        "No screen that sends is in view.",
-        "Move closer, until the screen fills the picture, and hold the camera level with it.",
-    ),
+    "no columns of": ("No screen that sends is in view.", f"{_CLOSER[:-1]}, and hold the camera level with it."),
 }
 _WORDS = {"no_screen": "no screen", "no_signal": "no signal", "unreadable": "no picture"}
 

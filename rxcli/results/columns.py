@@ -31,19 +31,11 @@ def packet_rows(result: FrameResult) -> list[dict[str, Any]]:
     """
     return [
         {
-            "frame": result.frame,
-            "time_s": result.time_s,
-            "column": column.column,
-            "burst": packet.burst,
+            **{name: getattr(result, name) for name in ("frame", "time_s")},
+            **{name: getattr(column, name) for name in ("column", "denoised", "w", "snr_db")},
+            **{name: getattr(packet, name) for name in ("burst", "confidence", "copies", "payload_bits", "payload")},
             "status": "ok" if packet.is_believable else "weak",
-            "denoised": column.denoised,
-            "w": column.w,
-            "snr_db": column.snr_db,
-            "confidence": packet.confidence,
-            "copies": packet.copies,
             "errors": packet.bit_errors,
-            "payload_bits": packet.payload_bits,
-            "payload": packet.payload,
         }
         for column in result.columns
         for packet in column.packets

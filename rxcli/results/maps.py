@@ -7,7 +7,7 @@ import numpy as np
 from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.receiver.plane.orientation import as_received
 from rxcli.results.overlay import drawing, outlines_of
-from rxcli.types import FloatArray, Frame, FrameResult
+from rxcli.types import Frame, FrameResult
 
 #: Width of a map, pixels, and points along a border.
 _WIDTH, _POINTS = 640, 13
@@ -37,7 +37,11 @@ def column_map(
     grids = []
     if result.corners is not None and screen is not None:
         pitch_px = float(np.linalg.norm(result.corners[1] - result.corners[0])) / screen.columns
-        grids = [{"pitch_px": pitch_px, "lines": _borders(result.corners, frame, screen, camera)}]
+        outlines = outlines_of(result.corners, screen.columns, frame, camera)
+        shown = np.linspace(0, outlines.rows.size - 1, _POINTS).astype(int)
+        scale = _WIDTH / frame.width
+        lines = [(np.column_stack([x[shown], outlines.rows[shown]]) * scale).round(1) for x in outlines.edges_x]
+        grids = [{"pitch_px": pitch_px, "lines": lines}]
     return {
         "title": "Where the columns may be",
         "text": "No grid of columns stands out: no strips of pixels change together."
@@ -48,16 +52,6 @@ def column_map(
         **_drawn(frame, read_strips(read_plane(frame)).coherence),
         "grids": grids,
     }
-
-
-def _borders(
-    corners: FloatArray, frame: Frame, screen: ScreenProfile, camera: CameraProfile | None
-) -> list[FloatArray]:
-    """(n, 2) pixels of the map along every border of a screen's columns."""
-    outlines = outlines_of(corners, screen.columns, frame, camera)
-    shown = np.linspace(0, outlines.rows.size - 1, _POINTS).astype(int)
-    scale = _WIDTH / frame.width
-    return [(np.column_stack([x[shown], outlines.rows[shown]]) * scale).round(1) for x in outlines.edges_x]
 
 
 def _drawn(frame: Frame, shares: Any) -> dict[str, Any]:
