@@ -27,6 +27,5 @@ def option_defaults(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         reason = f"{path}: cannot be read ({error}); it may hold screen, camera and workers"
         raise ProfileError(reason, "correct the file, or remove it") from None
-    profiles = {"screens": config.screen, "cameras": config.camera}
-    named = {name: [value] if isinstance(value, str) else value for name, value in profiles.items()}
-    return {name: value for name, value in {**named, "workers": config.workers}.items() if value is not None}
+    named = {"screens": config.screen, "cameras": config.camera, "workers": config.workers}
+    return {name: [value] if isinstance(value, str) else value for name, value in named.items() if value is not None}

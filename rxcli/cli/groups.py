@@ -1,6 +1,7 @@
 """Groups of commands: help without arguments, suggestions for mistyped names."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
+from typing import Any
 
 import click
 from click.exceptions import NoSuchCommand
@@ -15,10 +16,8 @@ class PlainFormatter(click.HelpFormatter):
     def write_text(self, text: str) -> None:
         super().write_text(text.replace("-", _UNBROKEN))
 
-    def write_dl(  # type: ignore[override]
-        self, rows: Sequence[tuple[str, str]], col_max: int = 30, col_spacing: int = 2
-    ) -> None:
-        super().write_dl([(name, text.replace("-", _UNBROKEN)) for name, text in rows], col_max, col_spacing)
+    def write_dl(self, rows: Iterable[tuple[str, str]], *spacing: int, **named: int) -> None:
+        super().write_dl([(name, text.replace("-", _UNBROKEN)) for name, text in rows], *spacing, **named)
 
     def write_heading(self, heading: str) -> None:
         self.write(f"{'':>{self.current_indent}}{click.style(f'{heading}:', bold=True)}\n")
@@ -44,9 +43,7 @@ class SuggestingGroup(click.Group):
             command.context_class = PlainContext
         return command
 
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
         try:
             return super().resolve_command(ctx, args)
         except NoSuchCommand as error:

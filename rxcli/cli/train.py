@@ -39,11 +39,10 @@ def train(out: Path, **options: Any) -> None:
     for package in ("torch", "onnx", "matplotlib"):
         if find_spec(package) is None:
             raise UsageError(f"training needs {package}, which is not installed", "run: pip install '.[train]'")
-    from rxcli.outputs import claim_folder
+    from rxcli.outputs import claim_folder, claim_own_folder
 
     claim_folder("OUT", out)
     from rxcli.lab.training import dataset, export, fit
-    from rxcli.outputs import claim_own_folder
 
     data, progress = out / "data", not options["quiet"]
     claim_own_folder("OUT", out, ("model.toml",))
