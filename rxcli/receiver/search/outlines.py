@@ -1,10 +1,8 @@
 """Outlines of the screens in a frame, given or proposed by the finder; or why there are none."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
@@ -196,34 +194,22 @@ def lean_on_its_side(cache: FrameCache, options: ReceiverOptions) -> float:
     frame is examined.
     """
     layouts = [layout for layout in layouts_of(options) if not layout.is_narrow]
-    upright = max((screen[0].contrast for screen in possible_screens(cache, options)), default=0.0)
+    shown = (screen[0] for screen in possible_screens(cache, options))
+    upright = max((outline.contrast for outline in shown if outline.stands_out), default=0.0)
     return cache.once(("lean", *layouts), lambda: _lean(cache, layouts, upright))
 
 
 def _lean(cache: FrameCache, layouts: list[find.ColumnLayout], upright: float) -> float:
-    """`lean_on_its_side` of a picture whose upright columns have a contrast of `upright`."""
+    """`lean_on_its_side` of a picture whose upright columns stand out by a contrast of `upright`; 0 if they do not."""
     frame = cache.frame
     if frame.index or not may_fill(frame) or frame.mosaic is not None:
         return 0.0
-    plane = turned(cache.plane)
-    lying = next(iter(find.find_screens(plane, layouts)), [])
-    if not lying or not lying[0].stands_out or lying[0].contrast < upright:
+    lean = stripe_lean(frame.pixels)
+    # Upright columns have stripes across them.
+    if abs(lean) < MIN_LEAN or lean > 0 < upright:
         return 0.0
-    corners = lying[0].corners
-    # Rows of the turned plane are columns of the picture.
-    shares = np.clip(corners[:, ::-1] / [plane.height, plane.width], 0, 1)
-    lean = stripe_lean(part_of(frame.pixels, shares * [frame.width, frame.height]))
-    return lean if abs(lean) >= MIN_LEAN else 0.0
-
-
-def part_of(pixels: NDArray[Any], corners: FloatArray | None) -> NDArray[Any]:
-    """The part of a picture that corners (n, 2) span; all of it if it is small or there are none."""
-    if corners is None:
-        return pixels
-    limits = [pixels.shape[1], pixels.shape[0]]
-    (left, top), (right, bottom) = (np.clip(edge(corners, axis=0), 0, limits).astype(int) for edge in (np.min, np.max))
-    part = pixels[top:bottom, left:right]
-    return part if min(part.shape) >= SETTINGS.min_rows else pixels
+    lying = next(iter(find.find_screens(turned(cache.plane), layouts)), [])
+    return lean if lying and lying[0].stands_out and lying[0].contrast >= upright else 0.0
 
 
 def reason_for_none(frame: Frame) -> str:

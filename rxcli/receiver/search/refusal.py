@@ -19,7 +19,7 @@ from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.frame.settings import SETTINGS as PASSES
 from rxcli.receiver.screen.stripes import MIN_LEAN, stripe_lean
 from rxcli.receiver.search.hypothesis import Hypothesis
-from rxcli.receiver.search.outlines import NO_COLUMNS, part_of, too_small
+from rxcli.receiver.search.outlines import NO_COLUMNS, too_small
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import as_one_column
@@ -61,7 +61,7 @@ def likeliest_reason(frame: Frame, result: FrameResult, options: ReceiverOptions
     reason, _, advice = message.partition("; ")
     if result.status == "no_screen":
         return f"{reason}, and {fades}; {advice}" if fades and reason.endswith(NO_COLUMNS) else message
-    if stripe_lean(part_of(frame.pixels, result.corners)) < MIN_LEAN:
+    if stripe_lean(frame.pixels) < MIN_LEAN:
         doubt = "the picture may show no screen that sends: no stripes run across it"
         return f"{doubt}, and {fades}; {_SHORTER}" if fades else f"{doubt}; if it does, {message}"
     return f"{fades}; {_SHORTER}" if fades else result.message

@@ -279,15 +279,19 @@ def test_a_clock_is_sought_once_for_all_exposures_that_are_not_long(
     assert len(sought) == n_sought
 
 
-@pytest.mark.parametrize(("upright", "lean"), [(5.0, 0.5), (20.0, 0.0)])
+@pytest.mark.parametrize(
+    ("upright", "lean", "found"),
+    [(5.0, -0.5, -0.5), (20.0, -0.5, 0.0), (5.0, 0.5, 0.0), (0.0, 0.5, 0.5), (0.0, 0.1, 0.0)],
+    ids=["turned", "upright columns stand out more", "upright stripes and columns", "portrait", "no stripes"],
+)
 def test_columns_that_stand_out_more_upright_do_not_lie_on_their_side(
-    monkeypatch: pytest.MonkeyPatch, upright: float, lean: float
+    monkeypatch: pytest.MonkeyPatch, upright: float, lean: float, found: float
 ) -> None:
     corners = np.array([[40.0, 40.0], [200.0, 40.0], [200.0, 130.0], [40.0, 130.0]])
     lying = Outline(corners, grid=replace(grid_between(corners, 20, (240, 200), None), contrast=10.0))
     monkeypatch.setattr(outlines.find, "find_screens", lambda *_: [[lying]])
-    monkeypatch.setattr(outlines, "stripe_lean", lambda _: 0.5)
-    assert outlines._lean(FrameCache(Frame(np.zeros((200, 240), np.uint8), "memory")), [], upright) == lean
+    monkeypatch.setattr(outlines, "stripe_lean", lambda _: lean)
+    assert outlines._lean(FrameCache(Frame(np.zeros((200, 240), np.uint8), "memory")), [], upright) == found
 
 
 @pytest.mark.parametrize(
