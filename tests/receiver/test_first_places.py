@@ -4,9 +4,12 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
+import pytest
 
 from rxcli.receiver.clip.acquiring import Place, agreeing
 from rxcli.receiver.clip.camera import Located
+from rxcli.receiver.clip.ends import dark_ends
+from rxcli.types import Frame
 
 CORNERS = np.array([[100.0, 50.0], [1700.0, 60.0], [1690.0, 950.0], [110.0, 940.0]])
 
@@ -29,3 +32,25 @@ def test_outlines_with_the_same_columns_outvote_a_surer_one() -> None:
 def test_cameras_that_read_slots_in_different_ways_do_not_agree() -> None:
     right, twice, upwards = place(60.0), place(45.0, rate_hz=17300.0), place(45.0, is_reversed=True)
     assert agreeing([twice, right, upwards]) == [right]
+
+
+def test_a_screen_ends_where_rows_blink_no_more() -> None:
+    """An outline that is 9 rows too long at the top and 4 at the bottom, of a picture with texture, in a hand."""
+    rng = np.random.default_rng(3)
+    texture, n_frames, columns = rng.uniform(60, 200, (240, 160)), 12, 4
+    corners = np.array([[8.0, 21.0], [152.0, 21.0], [152.0, 204.0], [8.0, 204.0]])
+    shifts = [np.array([k % 3, k % 4], float) for k in range(n_frames)]
+    frames = []
+    for shift in shifts:
+        lit = np.ones((240, 160))
+        lit[30:200, 8:152] = rng.uniform(0.3, 1, (17, columns)).repeat(10, axis=0).repeat(36, axis=1)
+        moved = np.roll(texture * lit, shift.astype(int)[::-1], axis=(0, 1))
+        frames.append(Frame(np.rint(moved).astype(np.uint8), "clip", len(frames), 0.0))
+    context: Any = SimpleNamespace(
+        camera=SimpleNamespace(lens=None, tone="linear", line_delay_s=1e-5),
+        screens=(SimpleNamespace(columns=columns, slot_rate_hz=1e4),),
+        sampled_corners=corners,
+    )
+    top, bottom = dark_ends(frames, shifts, context)
+    assert top == pytest.approx(9 + 2, abs=1)
+    assert bottom == pytest.approx(4 + 2, abs=1)

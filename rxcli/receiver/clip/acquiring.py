@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.receiver.clip.camera import ClipCamera, Located
-from rxcli.receiver.clip.common_clock import Start, start_by
+from rxcli.receiver.clip.common_clock import Start, hides_headers, start_by
+from rxcli.receiver.clip.ends import dark_ends
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Failure
@@ -90,15 +91,34 @@ class FirstFrames:
 
     def shown(self, camera: ClipCamera) -> FirstFrames:
         """The frames with what the first of them shows, by itself or without what all of them have in common."""
-        alone, found = self.located, self._without_texture(camera) if len(self.frames) > 1 else None
-        if found is not None and (
-            isinstance(alone, Failure) or alone.is_bent or alone.is_long or found.evidence > alone.evidence
-        ):
-            return found
+        alone = self.located
+        if len(self.frames) > 1:
+            texture = CommonTexture(self.frames, DEFAULT_TONE)
+            found = self._without_texture(camera, texture)
+            if found is not None and (
+                isinstance(alone, Failure) or alone.is_bent or alone.is_long or found.evidence > alone.evidence
+            ):
+                return found.with_ends(texture)
+            if isinstance(alone, Located) and isinstance(alone.found, Found) and alone.is_long:
+                start = start_by(alone.found, self.frames) if hides_headers(alone.found) else None
+                located = self._agreed_with_following(alone, camera, texture)
+                return FirstFrames(self.frames, located, start=start).with_ends(texture)
         shown = FirstFrames(self.frames[:1], alone)
         for frame in self.frames[1:]:
             shown = shown.with_frame(frame, camera)
         return shown
+
+    def _agreed_with_following(self, alone: Located, camera: ClipCamera, texture: CommonTexture) -> Located:
+        """The first frame with the outline on which it and some frames after it agree, each searched as it is."""
+        knowing, places = replace(camera, context=alone.context), [Place.of(alone)]
+        n_searched = SETTINGS.first_frames if camera.options.corners is None else 1
+        for frame, shift in zip(self.frames[1:n_searched], texture.shifts[1:], strict=False):
+            found = knowing.locate(FrameCache(frame))
+            if isinstance(found, Located):
+                places.append(Place.of(found, shift))
+        corners = np.median([place.corners for place in agreeing(places)], axis=0)
+        context = replace(alone.context, sampled_corners=corners)
+        return Located(replace(alone.outline, corners=corners), context, None, alone.framing)
 
     @property
     def evidence(self) -> float:
@@ -107,12 +127,17 @@ class FirstFrames:
             return self.start.log_evidence
         return self.located.evidence if isinstance(self.located, Located) else 0.0
 
-    def _without_texture(self, camera: ClipCamera) -> FirstFrames | None:
+    def with_ends(self, texture: CommonTexture) -> FirstFrames:
+        """The same with the ends of the screen by what blinks in the frames."""
+        assert isinstance(self.located, Located)
+        ends = dark_ends(self.frames, texture.shifts, self.located.context)
+        return replace(self, located=replace(self.located, dark_ends=ends))
+
+    def _without_texture(self, camera: ClipCamera, texture: CommonTexture) -> FirstFrames | None:
         """What the first frame shows without its texture: surest camera and median outline of some that agree.
 
         None where it shows no packets.
         """
-        texture = CommonTexture(self.frames, DEFAULT_TONE)
         flat = FrameCache(texture.removed_from(0))
         if not shows_same(self.frames[0], flat.frame, DEFAULT_TONE):
             return None

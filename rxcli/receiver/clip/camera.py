@@ -37,6 +37,8 @@ class Located:
     found: Found | Failure | None
     #: How sure the length of packets is, by the frame that showed the camera; None where it shows none.
     framing: Framing | None = None
+    #: Rows at the top and at the bottom of the outline that may not be on the screen; None where that is not known.
+    dark_ends: tuple[int, int] | None = None
 
     @property
     def camera_error(self) -> float:
@@ -99,7 +101,7 @@ class Located:
             return self
         own = self.context
         context = replace(located.context, cache=own.cache, sampled_corners=own.sampled_corners)
-        return Located(self.outline, context, None, located.framing)
+        return Located(self.outline, context, None, located.framing, self.dark_ends)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,6 +11,7 @@ import numpy as np
 
 from rxcli.numerics import NORMAL_MEDIAN, TINY, folded
 from rxcli.profiles import ScreenProfile
+from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.acquisition import Acquisition, distinct_screens, noise_of, variants_of
 from rxcli.receiver.frame.cache import FrameCache
@@ -43,6 +44,11 @@ def shows_little(context: FrameContext) -> bool:
     shown = min(float(corners[:, 1].max()), height - 1.0) - max(float(corners[:, 1].min()), 0.0)
     shortest_s = min(screen.packet_s for screen in context.screens)
     return shown * context.camera.line_delay_s < SETTINGS.few_packets * shortest_s
+
+
+def hides_headers(found: Found) -> bool:
+    """Whether exposures are so long that the light itself does not show where a header is."""
+    return found.best.reception.clock.exposure_slots > SLOTS_PER_SYMBOL / 2
 
 
 def common_clock(

@@ -13,10 +13,9 @@ import numpy as np
 
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
-from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.clip.acquiring import FirstFrames
 from rxcli.receiver.clip.camera import Acquired, ClipCamera, Located
-from rxcli.receiver.clip.common_clock import common_clock, start_by
+from rxcli.receiver.clip.common_clock import common_clock, hides_headers, start_by
 from rxcli.receiver.clip.ledger import Ledger
 from rxcli.receiver.clip.scene import TrackedScreen, by_copy_metrics
 from rxcli.receiver.clip.settings import SETTINGS
@@ -162,7 +161,7 @@ def _receive_first(known: Known, held: FirstFrames, located: Located) -> _Step:
     """Receive the first frames by what they show; where each shows little, they agree on a clock."""
     if held.start is not None:
         known.ledger.start = held.start
-    elif len(held.frames) > 1 and isinstance(found := located.found, Found) and _hides_headers(found):
+    elif len(held.frames) > 1 and isinstance(found := located.found, Found) and hides_headers(found):
         known.ledger.start = start_by(found, held.frames)
     elif len(held.frames) > 1 and located.shows_little:
         agreed = common_clock(held.frames, located.context, known.camera.options.screens)
@@ -176,11 +175,6 @@ def _receive_first(known: Known, held: FirstFrames, located: Located) -> _Step:
         after, more = _receive(after, frame)
         results += more
     return after, results
-
-
-def _hides_headers(found: Found) -> bool:
-    """Whether exposures are so long that the light itself does not show where a header is."""
-    return found.best.reception.clock.exposure_slots > SLOTS_PER_SYMBOL / 2
 
 
 # -- one frame ---------------------------------------------------------------------------------------------------------
@@ -307,7 +301,7 @@ def _receive_anew(
         return Lost(known), view, report
     with timer("sampling"):
         place = replace(acquired.context, sampled_corners=located.context.sampled_corners)
-        scene = TrackedScreen(place, acquisition, reception.model, named=options.corners is not None)
+        scene = TrackedScreen(place, acquisition, reception.model, options.corners is not None, located.dark_ends)
         view.light, view.pose = scene.strips(frame), scene.pose
     scene.update(view, lambda: reception.clock.on_grid(reception.posteriors.lit))
     return Tracking(known, scene), view, report

@@ -36,18 +36,27 @@ class TrackedScreen:
         acquisition: of that frame.
         model: light model of that frame.
         named: whether the user gave the corners.
+        dark_ends: rows at the top and at the bottom of the outline that may not be on the screen; None: unknown.
     """
 
-    def __init__(self, context: FrameContext, acquisition: Acquisition, model: ObservationModel, named: bool) -> None:
+    def __init__(
+        self,
+        context: FrameContext,
+        acquisition: Acquisition,
+        model: ObservationModel,
+        named: bool,
+        dark_ends: tuple[int, int] | None,
+    ) -> None:
         frame, corners, tone = context.frame, context.sampled_corners, context.camera.tone
         self._lens, self._named, self._acquisition = context.camera.lens, named, acquisition
         self._black_level, self._isi_memory = model.black_level, model.exposure.isi_memory
         column_px = float(np.linalg.norm(corners[1] - corners[0])) / acquisition.screen.columns
         self._n_strips = min(plane.strips_per_column(column_px), SETTINGS.max_strips)
-        outlines, self._n_end_rows = self._outlines(frame, corners), SETTINGS.end_rows
+        outlines, self._end_rows = self._outlines(frame, corners), (SETTINGS.end_rows, SETTINGS.end_rows)
         if decides_jointly(acquisition.clock):
-            self._n_end_rows = round(SETTINGS.end_slots * acquisition.clock.rows_per_slot)
-            outlines = replace(outlines, inside=_without_ends(outlines.inside, self._n_end_rows))
+            unsure = round(SETTINGS.end_slots * acquisition.clock.rows_per_slot)
+            self._end_rows = dark_ends or (unsure, unsure)
+            outlines = replace(outlines, inside=_without_ends(outlines.inside, *self._end_rows))
         strips = tracked.map_strips(outlines, frame, lambda coded: plane.tone_to_light(tone, coded))
         noise_floor = max(acquisition.profiles.noise_floor, MIN_VARIANCE * strips.pixels)
         #: Of a pixel.
@@ -276,7 +285,7 @@ class TrackedScreen:
     def _move(self, frame: Frame, found: Registration) -> None:
         """Move the strips to where the screen was found."""
         home, outlines = self._first_pose.map, self._outlines(frame, found.corners)
-        strips = tracked.moved_map(home, replace(outlines, inside=_without_ends(outlines.inside, self._n_end_rows)))
+        strips = tracked.moved_map(home, replace(outlines, inside=_without_ends(outlines.inside, *self._end_rows)))
         picture_row = geometry.rows_elsewhere(
             strips.rows, self._middles(found.corners), self._middles(self._first_pose.corners)
         )
@@ -396,10 +405,10 @@ def _header_contrast(columns: ColumnLight, rows: FloatArray, clock: Clock) -> fl
     return known_picture.header_contrast(columns, known_picture.row_positions(rows, clock), clock)
 
 
-def _without_ends(inside: BoolArray, n: int) -> BoolArray:
-    """(C, S, R) strips on the screen, without `n` rows at its ends, where the corners' error may reach."""
+def _without_ends(inside: BoolArray, top: int, bottom: int) -> BoolArray:
+    """(C, S, R) strips on the screen, without some rows at its ends, where the corners' error may reach."""
     left = np.zeros_like(inside)
-    left[..., n:-n] = inside[..., 2 * n :] & inside[..., : -2 * n]
+    left[..., top:-bottom] = inside[..., top + bottom :] & inside[..., : -top - bottom]
     return left
 
 

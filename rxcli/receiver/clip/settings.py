@@ -17,7 +17,7 @@ class ClipSettings(msgspec.Struct, frozen=True):
     still_sds: float = 2.5
     #: Rows at the ends of a moving screen that are not used: beyond the end it is dark, whatever the picture is there.
     end_rows: int = 2
-    #: The same in slots of exposures that last several, which show less of where the screen ends.
+    #: Slots by which the outline of a long exposure may be too long; not used where frames do not show its end.
     end_slots: float = 3.0
     #: Interval of searches for a screen at rest, and searches that establish rest.
     look_every: int = 8
