@@ -102,7 +102,7 @@ class TrackedScreen:
         if self.last is None:
             return None
         self._n_unlooked += 1
-        rests = self._n_rested >= SETTINGS.still_looks and self._n_updates >= SETTINGS.first_updates
+        rests = self._n_rested >= SETTINGS.still_looks
         if rests and self._n_unlooked < SETTINGS.look_every:
             view = self._view(cache, self.last, timeline, SETTINGS.rest_misfit)
             if view is not None:
