@@ -158,7 +158,7 @@ class _Walk:
         self._scored: list[Scored] = []
         self._tried: list[Tried] = []
         self._asked: set[tuple[object, ...]] = set()
-        #: Long exposures whose bright columns showed no packets.
+        #: Long exposures that showed no packets, or less than the best hypothesis.
         self._n_in_vain = 0
         self._number = count()
         self._fresh: list[_Entry] = []
@@ -267,28 +267,32 @@ class _Walk:
         The others follow if the bright ones come near the best score; if that is beyond doubt, if they beat its own.
         """
         best, acquisition = self._best(), _acquired(hypothesis)
-        # Without packets an estimated camera is rejected, and joint detection takes long.
-        is_costly = hypothesis.camera.hypothesis is not None and acquisition.clock.exposure_slots > LONG_EXPOSURE_SLOTS
-        if is_costly and self._n_in_vain >= SETTINGS.doubtful_budget:
+        # Joint detection takes long.
+        is_long = acquisition.clock.exposure_slots > LONG_EXPOSURE_SLOTS
+        is_costly = is_long and hypothesis.camera.hypothesis is not None
+        if is_long and self._n_in_vain >= SETTINGS.doubtful_budget:
             return
         if best is not None or is_costly:
             half = self._measured(hypothesis, acquisition.of_columns(acquisition.bright_columns))
-            min_score, min_evidence, lead = -np.inf, PASSES.min_packets_llr, 0.0
+            # Without packets an estimated camera is rejected.
+            min_evidence = SETTINGS.few_packets if is_costly else PASSES.min_packets_llr
+            min_score, lead = -np.inf, 0.0
             if best is not None:
                 lead = evidence.bright_score(best) - best.score if best.evidence > PASSES.min_packets_llr else 0.0
                 is_plain = best.evidence > SETTINGS.plain
                 min_score = best.score + (lead if is_plain else -SETTINGS.reach)
-                min_evidence = min(PASSES.min_packets_llr, best.evidence)
+                min_evidence = min(min_evidence, best.evidence)
             if half.score < min_score or half.evidence < min_evidence:
                 # By the bright columns alone scores are others than by all: the best one shows by how much.
                 self._tried.append(Tried(hypothesis, half.evidence, half.score - lead, "half"))
-                self._n_in_vain += is_costly and half.evidence < PASSES.min_packets_llr
+                self._n_in_vain += is_long
                 return
         scored = self._measured(hypothesis, acquisition)
         if scored.evidence > PASSES.min_packets_llr:
             # Packets may become certain once an estimated camera is fitted: then no other camera is tried.
             scored = self._fitted(scored)
         scored = _in_likeliest_bursts(scored)
+        self._n_in_vain += is_long and best is not None and scored.score <= best.score
         self._scored.append(scored)
         self._tried.append(Tried(hypothesis, scored.evidence, scored.score, "lost"))
         if scored.evidence > PASSES.min_packets_llr and (best is None or scored.score > best.score - SETTINGS.reach):
