@@ -165,14 +165,15 @@ def test_scores_by_the_bright_columns_compare_with_those_by_all() -> None:
 
 
 @pytest.mark.parametrize(
-    ("exposure_slots", "measured"),
+    ("exposure_slots", "evidence", "measured"),
     [
-        pytest.param(4.0, ["middle"] * 3, id="long exposures, until three were in vain"),
-        pytest.param(1.0, ["all", *["middle", "all"] * 4], id="short exposures"),
+        pytest.param(4.0, 30.0, ["middle"] * 3, id="long exposures, until three were in vain"),
+        pytest.param(4.0, 50.0, ["middle", "all"] * 4, id="long exposures, until three were no better"),
+        pytest.param(1.0, 1.0, ["all", *["middle", "all"] * 4], id="short exposures"),
     ],
 )
 def test_hypotheses_are_measured_on_their_bright_columns_first(
-    exposure_slots: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
+    exposure_slots: float, evidence: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock, own = SimpleNamespace(exposure_slots=exposure_slots), list[str]()
     middle = SimpleNamespace(part="middle")
@@ -180,7 +181,7 @@ def test_hypotheses_are_measured_on_their_bright_columns_first(
 
     def measure(_: object, __: object, acquisition: Any) -> Any:
         own.append(acquisition.part)
-        return SimpleNamespace(score=0.0, evidence=1.0, reception=None)
+        return SimpleNamespace(score=0.0, evidence=evidence, reception=None)
 
     monkeypatch.setitem(_Walk.run.__globals__, "_acquired", lambda _: acquisition)
     monkeypatch.setattr(_Walk, "_measured", measure)
