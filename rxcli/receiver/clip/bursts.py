@@ -98,7 +98,7 @@ def bursts_of(view: View) -> list[Burst]:
         copies, n_observed = view.first_copy + np.flatnonzero(which & shows_payload), view.shown[which].sum(axis=0)
         evidence = metrics[index]
         if joint is not None:
-            evidence = channel.metrics_of(llr_of(joint.lit[index]) * (n_observed > 0), 1)
+            evidence = channel.metrics_of(llr_of(joint.posteriors.lit[index]) * (n_observed > 0), 1)
         bursts.append(Burst(number, evidence, n_observed, (view.context.frame.index,), copies, view.tracked))
     return bursts
 

@@ -295,7 +295,7 @@ def _receive_anew(
         reception.snr,
         denoised,
         framing=acquired.framing,
-        joint=JointSlots.of(reception.clock, reception.posteriors) if is_joint else None,
+        joint=JointSlots(reception.clock.burst, reception.posteriors) if is_joint else None,
     )
     if not tracks:
         return Lost(known), view, report

@@ -163,7 +163,7 @@ class TrackedScreen:
         pose = self.pose
         with cache.timer("detect"):
             acquisition = self._acquired(observed.light, pose, picture, clock)
-            model, weights = self._model(clock), self.last.joint.w_log_prob
+            model, weights = self._model(clock), self.last.joint.posteriors.w_log_prob
             late = lateness(acquisition, model, weights, SETTINGS.long_step)
             clock = replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
             single = replace(acquisition, clock=clock.by_copy)
@@ -190,7 +190,7 @@ class TrackedScreen:
             snr,
             light=observed.light,
             pose=pose,
-            joint=JointSlots.of(clock, found),
+            joint=JointSlots(clock.burst, found),
         )
         self.update(view, lambda: lit)
         return view
@@ -321,7 +321,7 @@ class TrackedScreen:
             view: the frame.
             lit: gives the probability (C, N) that each of its slots is lit.
         """
-        if self._n_updates < SETTINGS.first_updates or (self._n_updates + 1) % SETTINGS.update_every == 0:
+        if self._n_updates < SETTINGS.first_updates or (self._n_updates + 1) % SETTINGS.first_updates == 0:
             self.learn(view, lit())
         else:
             self._n_updates += 1
@@ -373,8 +373,8 @@ class TrackedScreen:
         picture = self._picture.without(own).placed(pose.map.inside, pose.picture_row)
         if view.joint is not None:
             acquisition = self._acquired(view.light, pose, picture, clock)
-            known_better, _ = detect_jointly(acquisition, self._model(clock), view.joint.w_log_prob, known)
-            view.joint = JointSlots.of(clock, known_better)
+            known_better, _ = detect_jointly(acquisition, self._model(clock), view.joint.posteriors.w_log_prob, known)
+            view.joint = JointSlots(clock.burst, known_better)
             return
         columns = picture.solve(view.light)
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:

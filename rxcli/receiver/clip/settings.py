@@ -24,9 +24,8 @@ class ClipSettings(msgspec.Struct, frozen=True):
     still_looks: int = 3
     #: Inverse of the variance of a row's slots at which the row is not used for the picture.
     doubt_weight: float = 8.0
-    #: Frames from which the picture is learned one by one, and how often from then on.
+    #: Number of frames from which the picture is learned one by one, and of frames between any two later ones.
     first_updates: int = 12
-    update_every: int = 12
     #: Columns decided worse than this many times the foreseen variance do not fit what is known; and of a screen
     #: that is taken to rest: while it does 0.8 to 1.3 times, 2 pixels away 2 times and more.
     misfit: float = 40.0

@@ -42,14 +42,7 @@ class JointSlots:
 
     #: (n_copies,) bursts of the copies.
     burst: IntArray
-    #: (B, C, packet) probability that each slot is lit, and (C, 9) log probability of the weights.
-    lit: Float32Array
-    w_log_prob: FloatArray
-
-    @classmethod
-    def of(cls, clock: Clock, posteriors: BurstPosteriors) -> JointSlots:
-        """As detected on a clock."""
-        return cls(clock.burst, posteriors.lit, posteriors.w_log_prob)
+    posteriors: BurstPosteriors
 
 
 @dataclass(slots=True, eq=False)

@@ -5,13 +5,14 @@ strip, but not how its light changes from row to row. Room light and the linear 
 small to cost packets.
 """
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.numerics import NORMAL_MEDIAN
-from rxcli.types import Float32Array, FloatArray, LightPlane, Outlines, RowProfiles
+from rxcli.types import Float32Array, FloatArray, Frame, LightPlane, Outlines, RowProfiles
 
 #: Width of a strip in pixels from which a column is divided further, and maximum number of strips of a column.
 _STRIP_PX, _MAX_STRIPS = 12, 8
@@ -94,6 +95,13 @@ def _sums_at(sums: Float32Array, edges: Float32Array, first_row: int) -> Float32
     right *= part
     left += right
     return left
+
+
+def light_of_levels(frame: Frame, steps: int, to_light: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    """Linear light of every value that a pixel can have, in `steps` steps a level."""
+    values = np.arange(np.iinfo(frame.pixels.dtype).max * steps + 1, dtype=np.float64) / steps
+    encoded = np.clip((values - frame.black) / (frame.white - frame.black), 0, 1)
+    return encoded if frame.linear else to_light(encoded)
 
 
 def light_of(plane: LightPlane, values: Float32Array, tone: str) -> Float32Array:

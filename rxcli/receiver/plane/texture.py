@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rxcli.receiver.plane.rows import tone_to_light
+from rxcli.receiver.plane.rows import light_of_levels, tone_to_light
 from rxcli.types import Float32Array, FloatArray, Frame
 
 #: Light that every frame is taken to have besides, of full light, so that the noise of dark parts is no texture.
@@ -97,7 +97,5 @@ def _gradient(light: Float32Array) -> Float32Array:
 
 
 def _light_of_values(frame: Frame, tone: str) -> Float32Array:
-    values = np.arange(np.iinfo(frame.pixels.dtype).max + 1, dtype=np.float64)
-    encoded = np.clip((values - frame.black) / (frame.white - frame.black), 0, 1)
-    light = encoded if frame.linear else tone_to_light(tone, encoded)
+    light = light_of_levels(frame, 1, lambda coded: tone_to_light(tone, coded))
     return np.asarray(light + _ADDED_LIGHT, np.float32)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.receiver.plane.read import BAND_ROWS, cells_of
+from rxcli.receiver.plane.rows import light_of_levels
 from rxcli.types import BoolArray, Float32Array, FloatArray, Frame, Outlines
 
 #: Width of a cell of 8-bit values, minimum width of a strip for such cells, and maximum width: 16 bits hold its sum.
@@ -57,10 +58,7 @@ def map_strips(outlines: Outlines, frame: Frame, light_of: Callable[[FloatArray]
     is_summed = frame.pixels.dtype == np.uint8
     cell_px = _CELL_PX if is_summed and strip_px >= _MIN_PX else 1
     n_cells = max(round(strip_px / cell_px), 1)
-    scale = cell_px * n_cells if is_summed else 1
-    values = np.arange(np.iinfo(frame.pixels.dtype).max * scale + 1, dtype=np.float64) / scale
-    encoded = np.clip((values - frame.black) / (frame.white - frame.black), 0, 1)
-    light = np.asarray(encoded if frame.linear else light_of(encoded), np.float32)
+    light = np.asarray(light_of_levels(frame, cell_px * n_cells if is_summed else 1, light_of), np.float32)
     places = _places_of(outlines, cell_px, n_cells)
     return StripMap(cell_px, n_cells, int(outlines.rows[0]), places, light, outlines.inside)
 
