@@ -44,7 +44,9 @@ STRIP_FEATURES = (
     *("valid", "noise", "shot", "share", "exposure", "known"),
 )
 COLUMN_FEATURES = ("known", "phase[10]", "believed", "lent", "weight", "score", "information")
-N_STRIP_FEATURES, N_COLUMN_FEATURES = 26, 16
+N_STRIP_FEATURES, N_COLUMN_FEATURES = (
+    sum(int((re.findall(r"\d+", name) or ["1"])[0]) for name in names) for names in (STRIP_FEATURES, COLUMN_FEATURES)
+)
 #: Limit of residuals in features, standard deviations; the network was trained with it.
 _RESIDUAL_SIGMAS = 4.0
 #: Least distance of a slot's probability from 0 and 1 in features.

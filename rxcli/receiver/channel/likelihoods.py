@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import MIN_FLOAT32
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.patterns import by_pattern
 from rxcli.receiver.channel.picture import PER_SLOT, PictureSums, Prediction, by_place, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
-#: Degrees of freedom of the Student-t likelihood; `_density` is written for four.
+#: Degrees of freedom of the Student-t likelihood.
 _DEGREES = 4.0
 
 
@@ -117,22 +116,13 @@ def _pattern_metrics(observed: _Observed, prediction: Prediction) -> FloatArray:
         half = place * PER_SLOT // exposure.samples_per_slot
         whole, picture = observed.own * np.float32(level) + observed.neighbours[place], prediction.picture[half]
         variance = noise.through_picture(picture, prediction.variance, whole)
-        density = _density(observed.light[place] - picture * whole, variance)
-        np.log(np.maximum(density, MIN_FLOAT32, out=density), out=density)
+        density = _log_density(observed.light[place] - picture * whole, variance)
         return np.asarray(np.einsum("csn,csn->cn", density, weight[place]))
 
     return by_pattern(exposure, log_likelihood)
 
 
-def _density(residual: Float32Array, variance: Float32Array) -> Float32Array:
-    """Student-t density of residuals, up to a constant; overwrites its arguments.
-
-    With four degrees of freedom, variance v and residual r it is v^2 / (v + r^2 / 4)^2.5, which needs no logarithm.
-    """
-    wide = np.square(residual, out=residual)
-    wide *= np.float32(1 / _DEGREES)
-    wide += variance
-    variance /= wide
-    np.square(variance, out=variance)
-    variance /= np.sqrt(wide, out=wide)
-    return variance
+def _log_density(residual: Float32Array, variance: Float32Array) -> Float32Array:
+    """Student-t log density of residuals, up to a constant."""
+    wide = variance + np.square(residual) / _DEGREES
+    return np.asarray(_DEGREES / 2 * np.log(variance) - (_DEGREES + 1) / 2 * np.log(wide), np.float32)
