@@ -130,7 +130,7 @@ class _Model:
 
     def exposure(self, values: FloatArray, exposure_slots: float) -> tuple[float, float]:
         """The exposure near one that leaves least, and its standard deviation, slots."""
-        times, tried = self.times(values), exposure_slots * np.array(SETTINGS.exposure_factors)
+        times, tried = self.times(values), exposure_slots * SETTINGS.exposure_ratio ** np.array([1.0, 0.0, -1.0])
         left = [1 - self._near(self._slots.mean_over(times, exposure)).explained for exposure in tried.tolist()]
         misfit = np.log(np.maximum(left, TINY))
         at = int(np.clip(misfit.argmin(), 1, tried.size - 2))

@@ -394,7 +394,7 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
 
 def _line_spectrum(values: Float32Array, lag: int, size: int) -> FloatArray:
     """Power of values (C, n) over what is usual at such frequencies; places are cycles in `size` values."""
-    values = values - local_mean(values, 20 * SLOTS_PER_SYMBOL * lag // 2)
+    values = values - local_mean(values, SLOTS_PER_SYMBOL**2 * lag)
     n = values.shape[1]
     power = np.square(np.abs(np.fft.rfft(values * np.hanning(n).astype(np.float32), size, axis=1)))
     spectrum = (power / (power.mean(axis=1, keepdims=True) + TINY)).sum(axis=0)
@@ -435,7 +435,7 @@ def _slot_line(columns: Float32Array) -> FloatArray:
     steps = np.diff(columns, axis=1)
     square = np.asarray(steps * steps, np.float32)
     # The level's window is ten symbols at one row a slot, one at ten.
-    power = (square - local_mean(square, 10 * SLOTS_PER_SYMBOL)).sum(axis=0, dtype=np.float64)
+    power = (square - local_mean(square, SLOTS_PER_SYMBOL**2)).sum(axis=0, dtype=np.float64)
     spectrum = np.abs(np.fft.rfft(power, _FINE * columns.shape[1])) ** 2
     return np.asarray(spectrum / max(float(power @ power), TINY))
 

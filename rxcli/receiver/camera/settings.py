@@ -70,8 +70,8 @@ class EstimateSettings(msgspec.Struct, frozen=True):
     #: Steps of the fit, and how far the last one may move any row, slots.
     settle_steps: int = 4
     converged_slots: float = 0.03
-    #: Exposures around the one known that are compared, as factors.
-    exposure_factors: tuple[float, ...] = (0.75, 1.0, 1.33)
+    #: Exposures that are compared with the one known: this share of it, and the one that it is this share of.
+    exposure_ratio: float = 0.75
     #: Number of samples equivalent to an independent one, since errors within a slot and column are correlated.
     samples_per_independent: float = 10.0
     #: Least share of the light's local variance that a fit must explain.
