@@ -113,7 +113,7 @@ def _light_and_picture(
         *(by_place(each, _PER_SLOT) for each in (light, mean[:, None], samples.valid * known[:, None]))
     )
     sigma = dark_sigma(light, samples.valid, 0.0, _MIN_SIGMA)
-    prediction = predict_picture(sums, sigma**2, SETTINGS.picture_scales[-1:])
+    prediction = predict_picture(sums, sigma**2, SETTINGS.picture_scales[-1:], one_sided=False)
     picture = in_time(prediction.at_samples(_PER_SLOT)) * samples.valid
     light, picture = (each.sum(axis=1) / np.maximum(samples.valid.sum(axis=1), 1) for each in (light, picture))
     return light, np.where(known & (picture > sigma), picture, np.nan)

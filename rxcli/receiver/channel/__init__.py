@@ -7,9 +7,10 @@ Strip s of column c, exposed around the time g (in slots), receives
 where T is the local picture (textured, different in every strip), K the crosstalk from column c + k into the strip
 (smooth, known from the screen), h a slot convolved with the exposure (a trapezoid), and m the same for all strips.
 
-The picture is predicted at every sample from earlier and later samples, never from the slot itself, on the scale with
-the smallest local error, and that error is the variance of the prediction. The density of a sample is Student-t, so
-that an edge of the picture in one strip does not outweigh the other strips. The metric of a slot
+The picture is predicted at every sample from earlier samples, from later samples and from both, never from the slot
+itself. Each prediction uses the scale with the smallest local error, and that error is the variance of the prediction.
+The likelihood of a sample is a mixture over the three predictions, because at an edge of the picture only one side is
+valid. Its density is Student-t, so that an edge in one strip does not outweigh the other strips. The metric of a slot
 pattern is the sum of the log-likelihoods over strips and samples.
 
 The prediction of the picture needs the slots, so model and detection are iterated. The initial metrics compare every

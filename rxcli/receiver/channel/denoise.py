@@ -112,9 +112,9 @@ def _residual(
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Residual of light in standard deviations, one over these, and the picture; (C, S, n)."""
     sums = PictureSums.of(*(by_place(each, q) for each in (light, whole, valid)))
-    prediction = predict_picture(sums, noise.dark_variance, SETTINGS.picture_scales)
+    prediction = predict_picture(sums, noise.dark_variance, SETTINGS.picture_scales, one_sided=False)
     picture = in_time(prediction.at_samples(q))
-    variance = noise.through_picture(picture, np.repeat(prediction.variance, q, axis=-1), whole)
+    variance = noise.through_picture(picture, np.repeat(prediction.variance[0], q, axis=-1), whole)
     scale = np.asarray(valid / np.sqrt(variance), np.float32)
     return (light - picture * whole) * scale, scale, picture
 

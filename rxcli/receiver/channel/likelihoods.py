@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.numerics import MIN_FLOAT32
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.patterns import by_pattern
 from rxcli.receiver.channel.picture import PER_SLOT, PictureSums, Prediction, by_place, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
 
-#: Degrees of freedom of the Student-t likelihood.
+#: Degrees of freedom of the Student-t likelihood; `_density` is written for four.
 _DEGREES = 4.0
 
 
@@ -47,13 +48,14 @@ def slot_likelihoods(
         model: the light model.
         lit: (C, N) probability that each slot is lit, all columns.
         columns: numbers of the columns in `samples` and in the result.
-        is_initial: compute the lateness of the clock too, and predict the picture not on the finest scale.
+        is_initial: compute the lateness of the clock too, and predict the picture only from both sides together and
+            not on the finest scale, which is several times faster and sufficient for a plain picture.
     """
     expected, light = model.expected(lit, clock, columns, slope=is_initial), model.over_black(samples)
     observed = _Observed.of(light, samples.valid, expected, model)
     scales = SETTINGS.picture_scales[is_initial:]
     sums = PictureSums.of(observed.light, observed.whole, observed.valid)
-    prediction = predict_picture(sums, model.noise.dark_variance, scales)
+    prediction = predict_picture(sums, model.noise.dark_variance, scales, one_sided=not is_initial)
     late = np.zeros((0, 2)) if observed.slope is None else _timing(observed, observed.slope, prediction)
     return SlotLikelihoods(_pattern_metrics(observed, prediction), _slot_snr(observed, prediction), late)
 
@@ -89,9 +91,9 @@ def _slot_snr(observed: _Observed, prediction: Prediction) -> Float32Array:
 
     Evaluated in the middle of the slot, since the picture hardly changes within a slot.
     """
-    picture = prediction.picture[1]
+    picture = prediction.picture[0, 1]
     contrast = picture * observed.own
-    noise = observed.model.noise.through_picture(picture, prediction.variance, observed.own)
+    noise = observed.model.noise.through_picture(picture, prediction.variance[0], observed.own)
     ratio = contrast * contrast / noise * observed.valid[len(observed.valid) // 2]
     return np.asarray(ratio.sum(axis=1) * np.float32(SETTINGS.slot_information))
 
@@ -101,28 +103,37 @@ def _timing(observed: _Observed, slope: Float32Array, prediction: Prediction) ->
     picture = prediction.at_samples(len(observed.light))
     change = picture * slope
     residual = observed.light - picture * observed.whole
-    variance = observed.model.noise.through_picture(picture, prediction.variance, observed.whole)
+    variance = observed.model.noise.through_picture(picture, prediction.variance[0], observed.whole)
     weight = observed.valid / (variance + residual * residual / np.float32(_DEGREES))
     terms = (weight * change * factor for factor in (residual, change))
     return np.stack([term.sum(axis=(0, -2, -1), dtype=np.float64) for term in terms], axis=1)
 
 
 def _pattern_metrics(observed: _Observed, prediction: Prediction) -> FloatArray:
-    """Log-likelihoods summed over strips and the samples of a metric; (C, N + memory, patterns)."""
+    """Mixture log-likelihoods summed over strips and the samples of a metric; (C, N + memory, patterns)."""
     exposure, noise = observed.model.exposure, observed.model.noise
     weight = np.float32(SETTINGS.slot_information / exposure.samples_per_slot) * observed.valid
 
     def log_likelihood(place: int, level: float) -> Float32Array:
         half = place * PER_SLOT // exposure.samples_per_slot
-        whole, picture = observed.own * np.float32(level) + observed.neighbours[place], prediction.picture[half]
+        whole, picture = observed.own * np.float32(level) + observed.neighbours[place], prediction.picture[:, half]
         variance = noise.through_picture(picture, prediction.variance, whole)
-        density = _log_density(observed.light[place] - picture * whole, variance)
+        density = _density(observed.light[place] - picture * whole, variance).sum(axis=0)
+        np.log(np.maximum(density, MIN_FLOAT32, out=density), out=density)
         return np.asarray(np.einsum("csn,csn->cn", density, weight[place]))
 
     return by_pattern(exposure, log_likelihood)
 
 
-def _log_density(residual: Float32Array, variance: Float32Array) -> Float32Array:
-    """Student-t log density of residuals, up to a constant."""
-    wide = variance + np.square(residual) / _DEGREES
-    return np.asarray(_DEGREES / 2 * np.log(variance) - (_DEGREES + 1) / 2 * np.log(wide), np.float32)
+def _density(residual: Float32Array, variance: Float32Array) -> Float32Array:
+    """Student-t density of residuals, up to a constant; overwrites its arguments.
+
+    With four degrees of freedom, variance v and residual r it is v^2 / (v + r^2 / 4)^2.5, which needs no logarithm.
+    """
+    wide = np.square(residual, out=residual)
+    wide *= np.float32(1 / _DEGREES)
+    wide += variance
+    variance /= wide
+    np.square(variance, out=variance)
+    variance /= np.sqrt(wide, out=wide)
+    return variance

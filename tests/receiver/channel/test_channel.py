@@ -259,7 +259,7 @@ def test_a_slot_says_nothing_of_its_own_picture(q: int) -> None:
 
     def predicted(light: NDArray[np.float32]) -> NDArray[np.float32]:
         sums = PictureSums.of(*(by_place(each, q) for each in (light, expected, np.ones_like(light))))
-        return predict_picture(sums, 1e-4, (1, 2, 5)).picture
+        return predict_picture(sums, 1e-4, (1, 2, 5), one_sided=True).picture
 
     np.testing.assert_array_equal(in_time(by_place(light, q)), light)
     before, after = predicted(light), predicted(other)
