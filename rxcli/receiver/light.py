@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.numerics import MIN_FLOAT32, NORMAL_MEDIAN, TINY, local_mean
-from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL, slot_patterns
+from rxcli.protocol import HEADER, slot_patterns
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Points over which the mean of a sample or a strip is taken.
@@ -37,8 +37,8 @@ _DARK_TO = HEADER.index(1, _DARK_FROM)
 MIN_VARIANCE = 1e-7
 #: Largest light above black, relative to white, of a sample that counts as dark, and minimum number of those.
 _DARK_LIGHT, _MIN_DARK_SAMPLES = 0.001, 50
-#: Limit of a change of the light, in root mean squares.
-_MAX_CHANGE = 1.5
+#: Slots of the local level that changes of the light are relative to; limit of a change, in root mean squares.
+_LEVEL_SLOTS, _MAX_CHANGE = 8, 1.5
 #: Shortest exposure, slots, and narrowest spread of light, column pitches.
 _MIN_WIDTH = 1e-3
 
@@ -59,7 +59,7 @@ def changes_over(
     Returns:
         (M, R) changes against the local level, bounded; and 1 where they are on the screen.
     """
-    smooth, size = local_mean(light, max(round(rows / 2), 1)), round(SLOTS_PER_SYMBOL * rows)
+    smooth, size = local_mean(light, max(round(rows / 2), 1)), round(_LEVEL_SLOTS * rows)
     level = local_mean(light, size) / np.maximum(local_mean(inside, size), np.float32(TINY))
     n, before = light.shape[1], int(rows)
     share, change, valid = np.float32(rows - before), np.zeros_like(smooth), inside.copy()
