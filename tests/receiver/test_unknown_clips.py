@@ -178,11 +178,15 @@ def test_a_scene_learns_from_its_own_frames_only(monkeypatch: pytest.MonkeyPatch
     assert learned == ["own"]
 
 
-class _Shown(Located):
-    """Packets of some evidence, of a short exposure or a long one."""
+#: Of a screen in the picture.
+INSIDE = np.array([[100.0, 50.0], [500.0, 50.0], [500.0, 300.0], [100.0, 300.0]])
 
-    def __init__(self, evidence: float, is_long: bool = False) -> None:
-        super().__init__(Outline(np.zeros((4, 2))), None, None)
+
+class _Shown(Located):
+    """Packets of some evidence, of a short exposure or a long one, on a screen that may reach out of the picture."""
+
+    def __init__(self, evidence: float, is_long: bool = False, reaches_out: bool = False) -> None:
+        super().__init__(Outline(INSIDE * [10 if reaches_out else 1, 1]), None, None)
         self.__dict__.update(shown=evidence, long=is_long)
 
     evidence = property(lambda self: self.shown)
@@ -194,6 +198,8 @@ class _Shown(Located):
     [
         (_Shown(100), _Shown(90), True),
         (_Shown(100), _Shown(110), False),
+        (_Shown(100), _Shown(190, reaches_out=True), True),
+        (_Shown(100), _Shown(210, reaches_out=True), False),
         (_Shown(100, is_long=True), _Shown(110), True),
         (_Shown(100), _Shown(110, is_long=True), True),
         (Failure("no_signal", "none"), _Shown(50), False),
@@ -203,8 +209,7 @@ class _Shown(Located):
 def test_a_lost_screen_is_where_more_packets_are(
     there: Any, elsewhere: Any, is_taken_there: bool, clip: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Packets of a long exposure show on many outlines: it is taken to be where it was."""
+    """Packets of a long exposure show on many outlines, and a hand's edge looks like a side: it is where it was."""
     monkeypatch.setattr(ClipCamera, "locate", lambda _, cache, outlines=None: there if outlines else elsewhere)
-    corners = np.ones((4, 2))
-    found = ClipCamera(clip.options).locate_again(FrameCache(clip.frames[0]), Outline(corners), corners)
+    found = ClipCamera(clip.options).locate_again(FrameCache(clip.frames[0]), Outline(INSIDE), INSIDE)
     assert found is (there if is_taken_there else elsewhere)

@@ -152,7 +152,8 @@ class ClipCamera:
     def locate_again(self, cache: FrameCache, outline: Outline | None, corners: FloatArray | None) -> Located | Failure:
         """The same of a screen that was lost: where it was, or anywhere if that shows more packets.
 
-        Packets of a long exposure show on many outlines, so that it is taken to be where it was.
+        Packets of a long exposure show on many outlines, so that it is taken to be where it was; and the border of what
+        covers a part of a screen looks like the side of one that reaches out of the picture.
 
         Args:
             cache: the frame.
@@ -166,8 +167,10 @@ class ClipCamera:
             return there
         anywhere = self.locate(cache)
         here = there.evidence if isinstance(there, Located) else 0.0
-        if isinstance(anywhere, Located) and anywhere.evidence > here and not anywhere.is_long:
-            return anywhere
+        if isinstance(anywhere, Located) and not anywhere.is_long:
+            has_left = _width_in_view(anywhere.outline.corners, cache.frame) < _width_in_view(corners, cache.frame)
+            if anywhere.evidence > (search_settings.min_gain if has_left else 1.0) * here:
+                return anywhere
         return there
 
     def acquire(
@@ -222,6 +225,11 @@ class ClipCamera:
 
 def _framing_of(found: Found) -> Framing:
     return framing_of(found.best.acquisition, found.best.reception, found.screens)
+
+
+def _width_in_view(corners: FloatArray, frame: Frame) -> float:
+    """Share of the width of a screen with these corners that is in the picture."""
+    return float(np.ptp(np.clip(corners[:, 0], 0, frame.width)) / np.ptp(corners[:, 0]))
 
 
 def _kind_of(frame: Frame) -> tuple[object, ...]:
