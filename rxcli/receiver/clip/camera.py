@@ -192,7 +192,7 @@ class ClipCamera:
             return camera, Acquired(context, predicted, initial, framing_of(predicted, initial, self.options.screens))
         # Of the camera's lens, and in no need of refinement.
         outline = replace(located.outline, corners=corners, strips=None, grid=None)
-        found = located.found or search(cache, self.options, context, outlines=[outline])
+        found = located.found or search(cache, self.options, context, outlines=[outline], may_bend=located.is_bent)
         if isinstance(found, Failure):
             return camera, found
         if not self.is_compared:
