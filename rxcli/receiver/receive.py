@@ -88,7 +88,8 @@ def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None
     received = received._replace(result=replace(received.result, soft_bits=soft, message=message))
     if on_taps is not None and received.taps:
         on_taps(frame.source, frame.index, received.taps)
-    result = received.result
+    claims = ", ".join(frame.metadata.not_believed) if received.result.packets else ""
+    result = received.with_remark(claims and f"not believed: {claims}").result
     result = replace(result, message=_with_tried(result, options.screens), timing_ms=cache.timer.total())
     result = named(result, options)
     if options.mirrored:
@@ -103,13 +104,13 @@ def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str 
     return f"{result.message}; only the screen {screens[0].name} was tried (--screen auto tries all)"
 
 
-def _receive_still(cache: FrameCache, options: ReceiverOptions) -> Received:
-    """Receive every screen in a frame; the one with the most packets comes first."""
+def _receive_still(cache: FrameCache, options: ReceiverOptions, least: float) -> Received:
+    """Receive every screen in a frame with more than `least` evidence; the one with the most packets comes first."""
     nothing = FrameResult(cache.frame.source, cache.frame.index, cache.frame.time_s, "ok")
     screens = proposed_screens(cache, options)
     if isinstance(screens, Failure):
         return Received(failed(nothing, screens), {})
-    received = [_receive_screen(nothing, cache, outlines, options) for outlines in screens]
+    received = [_receive_screen(nothing, cache, outlines, options, least) for outlines in screens]
     clearest = received[0].result
     if not screens[0][0].stands_out and not clearest.packets and clearest.message != STEADY_LIGHT:
         return Received(failed(nothing, no_screen(cache, options)), {})
@@ -119,14 +120,16 @@ def _receive_still(cache: FrameCache, options: ReceiverOptions) -> Received:
 
 
 def _receive_screen(
-    nothing: FrameResult, cache: FrameCache, outlines: list[Outline], options: ReceiverOptions
+    nothing: FrameResult, cache: FrameCache, outlines: list[Outline], options: ReceiverOptions, least: float
 ) -> Received:
-    """Receive one screen; `nothing` is the result without any."""
+    """Receive one screen with more than `least` evidence; `nothing` is the result without any."""
     frame, timer = cache.frame, cache.timer
     # Search: where the columns are, what a row is in time, which screen and clock.
-    found = search(cache, options, outlines=outlines)
+    found = search(cache, options, outlines=outlines, least=least)
     if isinstance(found, Failure):
         return Received(failed(nothing, found), {})
+    if found.best.evidence <= least:
+        return Received(replace(nothing, search=tuple(tried.step for tried in found.tried)), {})
     outline, context, acquisition = found.outline, found.best.context, found.best.acquisition
     camera = context.camera
     # Channel and decode, in turn: metrics of slots to symbols, and symbols to the picture.
@@ -169,8 +172,7 @@ def _receive_screen(
         result = replace(result, message=too_small(context, acquisition.screen) or assemble.why_no_packet(columns))
     elif outline.column_offset is None:
         result = replace(result, message=result.numbering_remark)
-    claims = ", ".join(context.frame.metadata.not_believed) if result.packets else ""
-    return Received(result, _taps(found, reception)).with_remark(claims and f"not believed: {claims}")
+    return Received(result, _taps(found, reception))
 
 
 def _with_cut_packets(cache: FrameCache, received: Received, options: ReceiverOptions) -> FrameSoftBits | None:

@@ -169,7 +169,7 @@ class ClipCamera:
         here = there.evidence if isinstance(there, Located) else 0.0
         if isinstance(anywhere, Located) and not anywhere.is_long:
             has_left = _width_in_view(anywhere.outline.corners, cache.frame) < _width_in_view(corners, cache.frame)
-            if anywhere.evidence > (search_settings.min_gain if has_left else 1.0) * here:
+            if anywhere.evidence > (search_settings.borderless_gain if has_left else 1.0) * here:
                 return anywhere
         return there
 

@@ -1,18 +1,20 @@
 """Other ways to read a photograph that gives few packets: with an estimated camera, and turned by 90 degrees."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from math import inf, log
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.camera import FrameCamera
 from rxcli.receiver.frame.result import Failure, Received, failed, is_received
+from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.plane import orientation
 from rxcli.receiver.search.cameras import known_camera
 from rxcli.receiver.search.outlines import ON_ITS_SIDE, lean_on_its_side, unreadable_orientation
 from rxcli.receiver.search.refusal import STEADY_LIGHT, likeliest_reason
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.types import FrameResult
+from rxcli.types import Frame, FrameResult
 
 _UPSIDE_DOWN = (
     "the rows run against the readout, as in a picture that was turned upside down or mirrored after it was taken; "
@@ -22,10 +24,12 @@ _AS_STORED = (
     "the file asks to be turned by 90 degrees, but the columns stand upright in the stored picture; they are counted "
     "from its left"
 )
-#: Relative difference of line delays up to which an estimate agrees with a profile.
-_SAME_LINE_DELAY = 0.01
-#: Receives a photograph as it is.
-_Receive = Callable[[FrameCache, ReceiverOptions], Received]
+#: Relative difference of line delays up to which an estimate agrees with a profile, and confidence of a sure packet.
+_SAME_LINE_DELAY, _SURE = 0.01, SETTINGS.sure_certainty
+#: Packets of a long exposure that show that it was stated rightly.
+_PLAIN_LONG = 4
+#: Receives a photograph as it is, if a screen has evidence of packets of more than a least.
+_Receive = Callable[[FrameCache, ReceiverOptions, float], Received]
 
 
 def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Receive) -> Received:
@@ -44,7 +48,7 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
     attempts = []
     for quarter_turns in orientation.QUARTER_TURNS if lean < 0 else ():
         back = orientation.turned_frame(frame, quarter_turns)
-        attempt = receive(FrameCache(back, cache.timer).in_blinking_colours(), options)
+        attempt = receive(FrameCache(back, cache.timer).in_blinking_colours(), options, -inf)
         result = orientation.as_stored(back, attempt.result, quarter_turns)
         if not _gives_few(result):
             rank = not _is_reversed(result), attempt.n_believable, quarter_turns
@@ -57,15 +61,27 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
 
 
 def _receive_stated(cache: FrameCache, options: ReceiverOptions, receive: _Receive) -> Received:
-    """Receive a frame as its profile states the camera; where few columns give packets, also as it is estimated."""
-    stated, known = receive(cache, options), known_camera(cache.frame, options)
-    if known is None or not _gives_few(stated.result):
-        return stated
-    estimated = receive(cache, replace(options, cameras=(), force_camera=False))
-    # One packet is no evidence that what was stated is wrong.
-    if estimated.n_believable <= max(stated.n_believable, 1) or not _is_credible(estimated.result, known):
-        return stated
-    return estimated.with_remark(known.message if isinstance(known, Failure) else _difference(known, stated, estimated))
+    """Receive a frame as profile and file state its camera; where few columns give packets, also as it is estimated."""
+    best = stated = received = receive(cache, options, -inf)
+    evidence = max((step.evidence for step in stated.result.search), default=0.0)
+    for attempt, estimating in _with_estimates(cache, options):
+        is_plain = best.n_believable >= _PLAIN_LONG and _is_long(best.result, cache.frame, options)
+        is_plain |= sum(packet.confidence >= _SURE for packet in best.result.packets) > 1 and evidence > SETTINGS.plain
+        # Without a hypothesis of the camera its exposure did not count.
+        if not _gives_few(best.result) or is_plain or (attempt is not cache and not received.result.search):
+            break
+        received = receive(attempt, estimating, evidence)
+        # One packet is no evidence that what was stated is wrong.
+        if received.n_believable > max(best.n_believable, 1) and _is_credible(received.result, cache.frame, options):
+            message = _difference(cache.frame, options, stated, received, is_exposure=attempt is not cache)
+            best = received.with_remark(message)
+    return best
+
+
+def _is_long(result: FrameResult, frame: Frame, options: ReceiverOptions) -> bool:
+    """Whether the stated exposure lasts several slots of the screen, so that few packets are as many as expected."""
+    rate_hz = next((screen.slot_rate_hz for screen in options.screens if screen.name == result.screen_profile), 0.0)
+    return (frame.metadata.exposure_s or 0.0) * rate_hz > LONG_EXPOSURE_SLOTS
 
 
 def _gives_few(result: FrameResult) -> bool:
@@ -79,25 +95,65 @@ def _is_reversed(result: FrameResult) -> bool:
     return result.estimated.get("readout_reversed", (0.0, 0.0))[0] > 0
 
 
-def _is_credible(estimated: FrameResult, known: FrameCamera | Failure) -> bool:
-    """Whether a result with an estimated camera outweighs a profile; one that contradicts it needs sure packets.
+def _with_estimates(cache: FrameCache, options: ReceiverOptions) -> Iterator[tuple[FrameCache, ReceiverOptions]]:
+    """The frame without its camera profile, then without its stated exposure as well: both are estimated."""
+    frame, estimated = cache.frame, replace(options, cameras=(), force_camera=False)
+    if known_camera(frame, options) is not None:
+        yield cache, estimated
+    if frame.metadata.exposure_s is not None:
+        yield cache.with_metadata(replace(frame.metadata, exposure_s=None)), estimated
+
+
+def _is_credible(estimated: FrameResult, frame: Frame, options: ReceiverOptions) -> bool:
+    """Whether a result with an estimated camera outweighs what is stated; one that contradicts it needs sure packets.
 
     Under a screen that is not the one in the picture, an estimate of the camera may fit what a profile rules out.
     """
-    line_delay_s = estimated.line_delay_s
-    if isinstance(known, Failure) or line_delay_s is None:
-        return True
-    if abs(line_delay_s / known.line_delay_s - 1) < _SAME_LINE_DELAY:
+    known, line_delay_s = known_camera(frame, options), estimated.line_delay_s
+    is_same = True
+    if isinstance(known, FrameCamera) and line_delay_s is not None:
+        is_same = abs(line_delay_s / known.line_delay_s - 1) < _SAME_LINE_DELAY
+    if is_same and not _is_exposure_of_another(estimated, frame, options):
         return True
     lit = [column for column in estimated.columns if column.status != "dark"]
-    n_sure = sum(any(p.confidence > SETTINGS.sure_certainty for p in column.packets) for column in lit)
+    n_sure = sum(any(p.confidence > _SURE for p in column.packets) for column in lit)
     return 2 * n_sure > len(lit)
 
 
-def _difference(known: FrameCamera, stated: Received, estimated: Received) -> str:
-    """Message of a result with an estimated camera in place of that of a profile."""
+def _is_exposure_of_another(estimated: FrameResult, frame: Frame, options: ReceiverOptions) -> bool:
+    """Whether the exposure that the file states lasts as many slots of another screen as the light shows."""
+    rates = {screen.name: screen.slot_rate_hz for screen in options.screens}
+    own, stated_s, found_s = rates.get(estimated.screen_profile or ""), frame.metadata.exposure_s, estimated.exposure_s
+    if not own or not stated_s or not found_s:
+        return False
+    off = {rate: abs(log(found_s * own / (stated_s * rate))) for rate in rates.values()}
+    return min(off, key=off.__getitem__) != own
+
+
+def _difference(
+    frame: Frame, options: ReceiverOptions, stated: Received, estimated: Received, *, is_exposure: bool
+) -> str:
+    """Message of a result with an estimated camera: what was stated, and what was estimated.
+
+    Args:
+        frame: the picture.
+        options: those with the stated camera.
+        stated: result with the stated camera.
+        estimated: result with the estimate.
+        is_exposure: whether the exposure was estimated as well.
+    """
+    known, exposure_s = known_camera(frame, options), frame.metadata.exposure_s if is_exposure else None
+    if isinstance(known, Failure):
+        return known.message
+    before, after, check = [], [], "check what wrote the file's exposure"
+    if known is not None:
+        before.append(f"camera profile {known.profile} ({1e6 * known.line_delay_s:.3f} us a row)")
+        after.append(f"{1e6 * (estimated.result.line_delay_s or 0.0):.3f} us a row")
+        check = f"leave out or replace that profile, or {check}" if exposure_s else "leave out or replace that profile"
+    if exposure_s is not None:
+        before.append(f"the stated exposure ({1e6 * exposure_s:.0f} us)")
+        after.append(f"an exposure of {1e6 * (estimated.result.exposure_s or 0.0):.0f} us")
     return (
-        f"camera profile {known.profile} ({1e6 * known.line_delay_s:.3f} us a row) gave {stated.n_believable} packets, "
-        f"an estimate ({1e6 * (estimated.result.line_delay_s or 0.0):.3f} us a row) {estimated.n_believable}, "
-        "which are reported; leave out or replace that profile"
+        f"{' and '.join(before)} gave {stated.n_believable} packets, an estimate ({', '.join(after)}) "
+        f"{estimated.n_believable}, which are reported; {check}"
     )

@@ -38,7 +38,6 @@ class Proposer:
         outlines: that the screen may have.
         known: the camera and the screens, if known from other frames.
         may_bend: whether an unknown camera may have taken a distortion out.
-        doubted_s: exposure that the file states; the light shows it to be another one, or None.
     """
 
     cache: FrameCache
@@ -46,7 +45,6 @@ class Proposer:
     outlines: tuple[Outline, ...]
     known: FrameContext | None = None
     may_bend: bool = True
-    doubted_s: float | None = None
 
     def families(self) -> list[Outline]:
         """One outline of every family, likeliest first: packets are the same whichever column is the first."""
@@ -85,8 +83,6 @@ class Proposer:
     def _of_camera(self, camera: FrameCamera, log_prior: float) -> list[Hypothesis]:
         """Hypotheses of one camera: a screen for every outline and clock."""
         screens, out = self._screens(), []
-        if self.doubted_s and not _is_exposed_otherwise(camera, self.doubted_s):
-            return []
         if camera.hypothesis is not None:
             screens = tuple(screen for screen in screens if screen.packet_slots == camera.hypothesis.packet_slots)
         for outline in self.families():
@@ -155,15 +151,6 @@ class Proposer:
         for columns, screen in by_columns.items():
             if columns != n_columns and scored.evidence < SETTINGS.plain:
                 yield self._hypothesis(outline, camera, screen, log_prior)
-
-
-def _is_exposed_otherwise(camera: FrameCamera, stated_s: float) -> bool:
-    """Whether the light shows an exposure that is plainly not the stated one."""
-    if camera.hypothesis is None:
-        return False
-    exposures = np.array([camera.exposure_s, stated_s]) * (camera.hypothesis.exposure_slots / camera.exposure_s)
-    off = np.ptp(np.log(np.maximum(exposures, SETTINGS.shortest_exposure)))
-    return bool(off > 2 * SETTINGS.exposure_sd)
 
 
 def likeliest_of_family(outlines: Sequence[Outline]) -> Outline:

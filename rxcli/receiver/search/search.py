@@ -20,7 +20,7 @@ from rxcli.receiver.screen.find import ColumnLayout
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
-from rxcli.receiver.search.cameras import known_camera, settle
+from rxcli.receiver.search.cameras import settle
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
 from rxcli.receiver.search.numbers import less_likely_outlines, numbered
 from rxcli.receiver.search.outlines import proposed_screens, without_borders
@@ -42,6 +42,7 @@ def search(
     *,
     outlines: list[Outline] | None = None,
     may_bend: bool = True,
+    least: float = 0.0,
 ) -> Found | Failure:
     """Find outline, rows, camera, screen, clock and bursts of a frame.
 
@@ -51,72 +52,50 @@ def search(
         known: context of a frame of the same camera, if the camera and the screens are known.
         outlines: of the screen to receive; those of the clearest one in the picture if left out.
         may_bend: whether an unknown camera may have taken a distortion out, so that stripes are bent.
+        least: evidence that a better hypothesis has to exceed.
     """
     if outlines is None:
         screens = proposed_screens(cache, options)
         if isinstance(screens, Failure):
             return screens
         outlines = screens[0]
-    found = _believing(cache, options, known, outlines, may_bend)
-    packets, stated = _packet_evidence(found), cache.frame.metadata
-    is_doubtful = packets < SETTINGS.plain_estimate and found.tried and not _is_steady(found)
-    if not is_doubtful or known or not stated.exposure_s or known_camera(cache.frame, options) is not None:
-        return found
-    doubts = (*stated.not_believed, f"the stated exposure ({1e6 * stated.exposure_s:.0f} us)")
-    doubting = cache.with_metadata(replace(stated, exposure_s=None, not_believed=doubts))
-    otherwise = _search(Proposer(doubting, options, tuple(outlines), None, may_bend, stated.exposure_s))
-    min_evidence = max(SETTINGS.plain_estimate, SETTINGS.min_gain * packets)
-    return otherwise if _packet_evidence(otherwise) > min_evidence else found
-
-
-def _believing(
-    cache: FrameCache,
-    options: ReceiverOptions,
-    known: FrameContext | None,
-    outlines: list[Outline],
-    may_bend: bool,
-) -> Found | Failure:
-    """`search` with the exposure that the file states, among columns with borders or without."""
-
-    def search_among(some: list[Outline], known: FrameContext | None) -> Found | Failure:
-        return _search(Proposer(cache, options, tuple(some), known, may_bend))
-
-    found = search_among(outlines, known)
+    found = _search(cache, options, known, outlines, may_bend, least)
     packets = _packet_evidence(found)
     if outlines[0].family < 0 or (packets and outlines[0].stands_out):
         return found
     without = without_borders(cache)
     if not without:
         return found
-    borderless = search_among(without, known)
+    borderless = _search(cache, options, known, without, may_bend, least)
     if options.corners is not None:
         if isinstance(borderless, Failure) or not _packet_evidence(borderless):
             return found
         # Of one column that sends alone, its own rows give the camera, and the corners its number.
-        numbered_by_corners = search_among(outlines, borderless.best.context)
+        numbered_by_corners = _search(cache, options, borderless.best.context, outlines, may_bend, least)
         return numbered_by_corners if _packet_evidence(numbered_by_corners) else found
-    is_steady = _is_steady(borderless) and not packets
-    return borderless if is_steady or _packet_evidence(borderless) > SETTINGS.min_gain * packets else found
-
-
-def _is_steady(found: Found | Failure) -> bool:
-    return isinstance(found, Failure) and found.message == STEADY_LIGHT
+    is_steady = isinstance(borderless, Failure) and borderless.message == STEADY_LIGHT and not packets
+    return borderless if is_steady or _packet_evidence(borderless) > SETTINGS.borderless_gain * packets else found
 
 
 def _packet_evidence(found: Found | Failure) -> float:
     """Evidence of what was found, or 0 if it shows no packets."""
     if isinstance(found, Failure) or found.best.evidence < SETTINGS.few_packets:
         return 0.0
-    # Long exposures explain the light of short ones to some extent.
-    share = SETTINGS.plain_estimate / SETTINGS.plain if found.best.reception.is_long else 1.0
-    return share * found.best.evidence
+    return found.best.evidence
 
 
-def _search(proposer: Proposer) -> Found | Failure:
-    """`search` among what is proposed."""
-    outlines = proposer.outlines
+def _search(
+    cache: FrameCache,
+    options: ReceiverOptions,
+    known: FrameContext | None,
+    outlines: list[Outline],
+    may_bend: bool,
+    least: float,
+) -> Found | Failure:
+    """`search` among outlines."""
+    proposer = Proposer(cache, options, tuple(outlines), known, may_bend)
     is_doubtful = not outlines[0].stands_out and outlines[0].family >= 0
-    walk = _Walk(proposer, SETTINGS.doubtful_budget if is_doubtful else SETTINGS.budget)
+    walk = _Walk(proposer, SETTINGS.doubtful_budget if is_doubtful else SETTINGS.budget, least)
     best = walk.run()
     min_evidence = (
         PASSES.min_packets_llr if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
@@ -126,7 +105,7 @@ def _search(proposer: Proposer) -> Found | Failure:
     if best is None:
         return replace(why_no_packets(proposer, walk.nearest, walk.failure), tried=walk.record(None))
     if best.evidence >= SETTINGS.few_packets:
-        outlines = tuple(less_likely_outlines(best, outlines, proposer))
+        outlines = less_likely_outlines(best, outlines, proposer)
     chosen = numbered(best.hypothesis.outline, outlines, walk.score_of)
     refused = light_without_data(best.context, best.reception)
     if refused is not None:
@@ -153,8 +132,8 @@ def _corners_by_slots(outline: Outline, best: Scored) -> FloatArray:
 class _Walk:
     """One search under way."""
 
-    def __init__(self, proposer: Proposer, budget: int) -> None:
-        self._proposer, self._budget = proposer, budget
+    def __init__(self, proposer: Proposer, budget: int, least: float = 0.0) -> None:
+        self._proposer, self._budget, self._least = proposer, budget, least
         self._scored: list[Scored] = []
         self._tried: list[Tried] = []
         self._asked: set[tuple[object, ...]] = set()
@@ -282,7 +261,7 @@ class _Walk:
                 is_plain = best.evidence > SETTINGS.plain
                 min_score = best.score + (lead if is_plain else -SETTINGS.reach)
                 min_evidence = min(min_evidence, best.evidence)
-            if half.score < min_score or half.evidence < min_evidence:
+            if half.score < min_score or half.evidence < max(min_evidence, self._least / 2):
                 # By the bright columns alone scores are others than by all: the best one shows by how much.
                 self._tried.append(Tried(hypothesis, half.evidence, half.score - lead, "half"))
                 self._n_in_vain += is_long

@@ -22,9 +22,8 @@ class SearchSettings(msgspec.Struct, frozen=True):
     budget: int = 24
     doubtful_budget: int = 3
     hopeless_budget: int = 8
-    #: Evidence of a screen without borders, or of an exposure that is not the stated one, times that of what was found
-    #: with them, from which it is taken instead.
-    min_gain: float = 2.0
+    #: Evidence of a screen without borders, times that of doubtful columns, from which it is taken instead.
+    borderless_gain: float = 2.0
     #: Siblings of a scored hypothesis get a pass if their score could come this near to the best one; log-odds within
     #: which an outline is possible.
     reach: float = 3.0

@@ -165,15 +165,16 @@ def test_scores_by_the_bright_columns_compare_with_those_by_all() -> None:
 
 
 @pytest.mark.parametrize(
-    ("exposure_slots", "evidence", "measured"),
+    ("exposure_slots", "evidence", "least", "measured"),
     [
-        pytest.param(4.0, 30.0, ["middle"] * 3, id="long exposures, until three were in vain"),
-        pytest.param(4.0, 50.0, ["middle", "all"] * 4, id="long exposures, until three were no better"),
-        pytest.param(1.0, 1.0, ["all", *["middle", "all"] * 4], id="short exposures"),
+        pytest.param(4.0, 30.0, 0.0, ["middle"] * 3, id="long exposures, until three were in vain"),
+        pytest.param(4.0, 50.0, 0.0, ["middle", "all"] * 4, id="long exposures, until three were no better"),
+        pytest.param(1.0, 1.0, 0.0, ["all", *["middle", "all"] * 4], id="short exposures"),
+        pytest.param(1.0, 100.0, 300.0, ["all", *["middle"] * 4], id="not all if more evidence is needed"),
     ],
 )
 def test_hypotheses_are_measured_on_their_bright_columns_first(
-    exposure_slots: float, evidence: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
+    exposure_slots: float, evidence: float, least: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock, own = SimpleNamespace(exposure_slots=exposure_slots), list[str]()
     middle = SimpleNamespace(part="middle")
@@ -190,20 +191,10 @@ def test_hypotheses_are_measured_on_their_bright_columns_first(
     monkeypatch.setitem(_Walk.run.__globals__, "_in_likeliest_bursts", lambda scored: scored)
     monkeypatch.setitem(_Walk.run.__globals__, "evidence", SimpleNamespace(bright_score=lambda _: 0.0))
     proposer: Any = SimpleNamespace(siblings=lambda _: (), cameras=lambda: None)
-    walk = _Walk(proposer, 8)
+    walk = _Walk(proposer, 8, least)
     for _ in range(5):
         walk._score(estimated)
     assert own == measured
-
-
-@pytest.mark.parametrize(("stated", "n_proposed"), [(1.2, 0), (10.0, 1), (0.1, 1)])
-def test_where_a_stated_exposure_is_doubted_others_are_proposed(stated: float, n_proposed: int) -> None:
-    trial = trial_of("paper-17k3")
-    cache = FrameCache(replace(trial.frame, metadata=Metadata()))
-    own, options = Proposer(cache, ReceiverOptions(cameras=()), (Outline(trial.corners),)), ReceiverOptions(cameras=())
-    camera = next(own.cameras())[0].camera
-    doubting = Proposer(cache, options, own.outlines, doubted_s=stated * camera.exposure_s)
-    assert (len(doubting._of_camera(camera, 0.0)) > 0) == n_proposed
 
 
 @pytest.mark.parametrize("is_long", [True, False])
