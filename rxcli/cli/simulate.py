@@ -54,6 +54,7 @@ _LIST = {"is_eager": True, "expose_value": False, "callback": _list}
     ("--preset=NAME", PRESETS, "xs10-still", f"Kind of camera: {', '.join(PRESETS)}."),
     ("--screen", str, "paper-34k6", "Screen profile: a name or a TOML file."),
     ("--picture", str, "coffee", "Picture shown: a file, or a name (see --list)."),
+    ("--film", str, None, "Play a film, as pan:4, cut:12+subtitles or zoom:1.01+window; see docs/simulator.md."),
     ("--payload", str, "random", "'random', 'hex:...', or a file; sent over and over."),
     ("--text", str, None, "Send this text (a longer one as a file), for the link layer to receive."),
     ("--uri", str, None, "Send this URI."),
@@ -131,6 +132,7 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
         scene = with_fields(scene, _table(text))
     sent, given = _sent(options, scene.screen), _given(options, _SCENE_OPTIONS)
     scene = replace(scene, w=_weights(options["weights"]), **sent, **given)
+    scene = replace(scene, film=replace(scene.film, shows=options["film"] or scene.film.shows))
     scene = _with_pose(scene, options)
     changes: dict[str, Callable[[Any], Scene]] = {
         "readout_s": lambda seconds: scene.read_in(seconds),

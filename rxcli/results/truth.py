@@ -21,7 +21,7 @@ import msgspec
 from msgspec import Meta
 
 from rxcli.errors import InputError
-from rxcli.protocol import WEIGHTS, packet_slots
+from rxcli.protocol import WEIGHTS, packet_slots, payload_bits
 from rxcli.resources import read_limited
 from rxcli.types import ColumnResult, FrameResult, PacketResult
 
@@ -66,8 +66,15 @@ class Truth(msgspec.Struct, frozen=True, kw_only=True):
     frames: tuple[TruthFrame, ...] = ()
     #: Burst number -> one hex string per column, first bit most significant.
     payload: dict[int, tuple[str, ...]]
+    #: Burst number -> `w` per column, of a film whose picture dims the columns; others have `w` all the time.
+    w_of_burst: dict[int, tuple[int, ...]] = {}
     screen: str | None = None
     camera: dict[str, Any] | None = None
+
+    def bits(self, burst: int, column: int) -> int:
+        """Payload bits of a packet."""
+        weights = self.w_of_burst.get(burst)
+        return self.payload_bits[column] if weights is None else payload_bits(weights[column], self.payload_symbols)
 
     @property
     def expected_bursts(self) -> frozenset[int]:
@@ -108,17 +115,19 @@ def _contradictions(truth: Truth) -> Iterator[str]:
     """What is inconsistent in `truth`."""
     per_column: dict[str, Sized] = {"w": truth.w, "payload_bits": truth.payload_bits}
     per_column |= {f"payload of burst {burst}": row for burst, row in truth.payload.items()}
+    per_column |= {f"w of burst {burst}": row for burst, row in truth.w_of_burst.items()}
     for name, values in per_column.items():
         if len(values) != truth.columns:
             yield f"{name} must have one entry per column, {truth.columns} (got {len(values)})"
-    for w in sorted(set(truth.w) - set(WEIGHTS)):
+    for w in sorted(set(truth.w).union(*truth.w_of_burst.values()) - set(WEIGHTS)):
         yield f"w must be in 1..9 (got {w})"
     if not truth.payload:
         yield "no payload is known; name the file that vlc-rx encode --truth wrote of these slots"
     for burst in sorted({b.burst for f in truth.frames for b in f.bursts} - truth.payload.keys()):
         yield f"payload must hold every burst that a frame shows (burst {burst} is missing)"
     for burst, row in truth.payload.items():
-        for column, (text, n) in enumerate(zip(row, truth.payload_bits, strict=True)):
+        for column, text in enumerate(row):
+            n = truth.bits(burst, column)
             if 4 * len(text) < n or not set(text) <= set(hexdigits):
                 yield f"payload of burst {burst}, column {column}, must be hex of at least {n} bits (got {text!r:.60})"
 
@@ -231,14 +240,15 @@ class Scorer:
 
     def _errors(self, packet: PacketResult, column: int, burst: int) -> tuple[int, int]:
         """Wrong bits of a packet if it is that of a burst, and the bits of the longer of both."""
-        sent, n_sent = self._truth.payload[burst][column], self._truth.payload_bits[column]
+        sent, n_sent = self._truth.payload[burst][column], self._truth.bits(burst, column)
         errors = wrong_bits(packet.payload, packet.payload_bits, sent, n_sent)
         return errors, max(n_sent, packet.payload_bits)
 
     def _add_column(self, column: ColumnResult, bursts: tuple[int, ...]) -> ColumnResult:
-        sent_w = dict(enumerate(self._truth.w)).get(column.column)
-        self._wrong_w += column.w not in (None, sent_w)
-        candidates = () if sent_w is None else bursts
+        sent = [self._truth.w, *filter(None, map(self._truth.w_of_burst.get, bursts))]
+        is_known = column.column < self._truth.columns
+        self._wrong_w += column.w not in (None, *(weights[column.column] for weights in sent if is_known))
+        candidates = bursts if is_known else ()
         return replace(column, packets=tuple(self._add_packet(p, column.column, candidates) for p in column.packets))
 
     def _add_packet(self, packet: PacketResult, column: int, bursts: tuple[int, ...]) -> PacketResult:
@@ -259,8 +269,8 @@ class Scorer:
         bursts: Iterable[int] = self._truth.expected_bursts
         if not self._truth.frames:
             bursts = self._located or self._distinct[:1]
-        bits = enumerate(self._truth.payload_bits)
-        return {(burst, column): n for column, n in bits if n for burst in sorted(bursts)}
+        places = [(burst, column) for column in range(self._truth.columns) for burst in sorted(bursts)]
+        return {place: n for place in places if (n := self._truth.bits(*place))}
 
     def faults(self) -> list[Fault]:
         """Expected packets of the frames so far that were lost or have wrong bits."""

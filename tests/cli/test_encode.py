@@ -174,7 +174,7 @@ def test_raw_payload_is_what_the_simulator_sends(tmp_path: Path, content: str) -
     assert np.array_equal(read_slots(out, screen), link.slots(0, 2 * 3 * 70).T)
     truth = load_truth(truth_file)
     assert truth.payload == {b: tuple(bits_to_hex(bits) for bits in link.payload(b)) for b in range(2)}
-    assert truth.payload_bits == tuple(link.bits_per_column)
+    assert truth.payload_bits == tuple(link.bits_per_column())
 
 
 @pytest.mark.parametrize(

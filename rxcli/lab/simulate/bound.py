@@ -90,7 +90,7 @@ class OracleRecorder:
         step = self._exposure.grid_rows
         # The columns' light hardly changes over a cell of the grid: its value in the middle stands for all its rows.
         middles = band.top + np.arange(0, mean.shape[0], step, dtype=np.float64) + (step - 1) / 2
-        light = column_light(self._exposure, x, middles).astype(np.float64)
+        light = column_light(self._exposure, x, middles, self._exposure.drive).astype(np.float64)
         for number, own in enumerate(light):
             part = slice(number * step, min((number + 1) * step, mean.shape[0]))
             rows = slice(band.top + part.start, band.top + part.stop)

@@ -9,11 +9,13 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.lab.simulate.film import Player
 from rxcli.lab.simulate.motion import HandMotion, turned, turned_back
 from rxcli.lab.simulate.optics import CORNERS, Float32Array, FloatArray, View, between_nodes, grid_nodes, project
 from rxcli.lab.simulate.scenes import Scene
@@ -28,6 +30,8 @@ _BAND_ROWS = 256
 _TEXTURE_MARGIN = 12
 #: Rounds after which a place of the screen is on the row that is read when it is there.
 _MOTION_ROUNDS = 4
+#: Places across and down at which the heights that rows see are sampled.
+_HEIGHTS = 40
 #: Decay times after which light has gone, and points across the sensor at which the light that glares is sampled.
 DECAY_TIMES, _GLARE_POINTS = 8, 200
 #: Breadth of the dark frame around the panel, in screen widths.
@@ -55,6 +59,8 @@ class Exposure:
     start_s: float = 0.0
     #: How the camera moves meanwhile; None for one on a tripod.
     motion: HandMotion | None = None
+    #: The film that the screen shows; None for the picture of `drive` at rest.
+    player: Player | None = None
 
     @cached_property
     def row_start_slots(self) -> FloatArray:
@@ -86,7 +92,33 @@ class Exposure:
     def _motion_of_rows(self, rows: FloatArray) -> FloatArray:
         """(..., 4) how far the camera has moved when the rows are in the middle of their exposure."""
         assert self.motion is not None
-        return self.motion.at(self.start_s + rows * self.scene.sensor.line_delay_s + self.scene.exposure_s / 2)
+        return self.motion.at(self._middles_s(rows))
+
+    def _middles_s(self, rows: FloatArray) -> FloatArray:
+        """Time of the clip in the middle of the exposure of rows."""
+        return self.start_s + rows * self.scene.sensor.line_delay_s + self.scene.exposure_s / 2
+
+    def panel(self, x: Float32Array, y: Float32Array, top: int) -> list[Float32Array]:
+        """For each kind of light (rows, width, 3) texture at places of it (rows, width), of rows from `top` on."""
+
+        def at_places(textures: tuple[Float32Array, ...]) -> list[Float32Array]:
+            flags: dict[str, int] = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_CONSTANT}
+            return [np.asarray(cv2.remap(texture, x, y, **flags)) for texture in textures]
+
+        if self.player is None:
+            return at_places(self.textures[0][0])
+        lines = self.drive.grey.shape[0] * self.texture_scale[0]
+        height = np.clip((y + 0.5 - _TEXTURE_MARGIN) / lines, 0, 1)
+        middles_s = self._middles_s(top + np.arange(len(y), dtype=np.float64))
+        begun = self.player.refreshes(middles_s[:, None], height)
+        number = np.clip(np.floor(begun), self.refreshes[0], self.refreshes[-1])
+        old = np.exp((number - begun) / (self.scene.film.refresh_hz * self.scene.film.response_s)).astype(np.float32)
+        images = [np.zeros((*y.shape, 3), np.float32) for _ in self.decays]
+        for refresh, textures in zip(self.refreshes, self.textures, strict=True):
+            if (here := number == refresh).any():
+                for image, new, before in zip(images, *map(at_places, textures), strict=True):
+                    image[here] = (new + old[..., None] * (before - new))[here]
+        return images
 
     @property
     def exposure_slots(self) -> float:
@@ -102,12 +134,29 @@ class Exposure:
     @cached_property
     def lit(self) -> tuple[FloatArray, ...]:
         """For each kind of light (height, columns) share of every row's exposure in which a column is lit."""
+        return self._lit(*self._slots)
+
+    @cached_property
+    def lit_by_drive(self) -> list[tuple[Drive, tuple[FloatArray, ...]]]:
+        """What the backlight was driven with, and `lit` by the slots of that time: in a film, a part for each burst."""
+        if self.player is None:
+            return [(self.drive, self.lit)]
+        first_slot, slots = self._slots
+        bursts = (first_slot + np.arange(slots.shape[1])) // self.link.burst_slots
+        return [(self.player.drive_in(int(b)), self._lit(first_slot, slots * (bursts == b))) for b in np.unique(bursts)]
+
+    @cached_property
+    def _slots(self) -> tuple[int, NDArray[Any]]:
+        """Number of the first slot that the frame shows, and (columns, slots) all of them."""
         starts = self.row_start_slots
         first_slot = max(int(np.floor(starts[0] - self.delays.max() - DECAY_TIMES * self.decays[-1])), 0)
         last_slot = int(np.ceil(starts[-1] + self.exposure_slots - self.delays.min())) + 1
         first_slot = min(first_slot, int(np.floor(starts[0] - self.delays.max())) - 1)
-        slots = self.link.slots(first_slot, last_slot)
-        delayed = list(zip(slots, starts - self.delays[:, None] - first_slot, self.link.weights / 10, strict=True))
+        return first_slot, self.link.slots(first_slot, last_slot)
+
+    def _lit(self, first_slot: int, slots: NDArray[Any]) -> tuple[FloatArray, ...]:
+        starts = self.row_start_slots - self.delays[:, None] - first_slot
+        delayed = list(zip(slots, starts, self.link.weights / 10, strict=True))
         shares = [[lit_share(column, start, self.exposure_slots) for column, start, _ in delayed]]
         for decay in self.decays[1:]:
             shares += [[lagging_share(column, start, self.exposure_slots, decay, w) for column, start, w in delayed]]
@@ -126,8 +175,8 @@ class Exposure:
         sensor, step = self.scene.sensor, self.scene.sensor.width // _GLARE_POINTS + 1
         x, y = (np.arange(0, size, step, dtype=np.float64) for size in (sensor.width, sensor.height))
         places = _in_texture(self, x, y)
-        light, total = column_light(self, x, y), np.zeros((sensor.height, 3))
-        for texture, lit in zip(self.textures, self.lit, strict=True):
+        light, total = column_light(self, x, y, self.drive), np.zeros((sensor.height, 3))
+        for texture, lit in zip(self.textures[-1][0], self.lit, strict=True):
             image = cv2.remap(texture, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
             total += lit @ np.einsum("ycx,yxk->ck", light, image) / image[..., 0].size
         return np.asarray(total * self.scene.glare)
@@ -151,18 +200,29 @@ class Exposure:
         return (3, 3) if self.scene.panel > 0 and magnification > _RESOLVED_PX else (1, 1)
 
     @cached_property
-    def textures(self) -> tuple[Float32Array, ...]:
-        """For each kind of light (h, w, 3) electrons of the sensor's colours per unit of green light, blurred.
+    def refreshes(self) -> range:
+        """Refreshes of a film that the frame shows."""
+        if self.player is None:
+            return range(1)
+        rows = np.linspace(0, self.scene.sensor.height - 1, _HEIGHTS)
+        x = np.linspace(0, self.scene.sensor.width - 1, _HEIGHTS)
+        heights = np.clip(self.pixels_to_screen(np.stack(np.meshgrid(x, rows), axis=-1))[..., 1], 0, 1)
+        begun = self.player.refreshes(self._middles_s(rows)[:, None], heights)
+        return range(int(np.floor(begun.min())), int(np.floor(begun.max())) + 1)
 
-        There is a black margin around the panel.
+    @cached_property
+    def textures(self) -> list[list[tuple[Float32Array, ...]]]:
+        """For each of `refreshes` what it writes and, in a film, what it finds; for each kind of light (h, w, 3).
+
+        Electrons of the sensor's colours per unit of green light, blurred, with a black margin around the panel.
         """
+        panels = [(self.drive.transmittance,)] if self.player is None else map(self.player.panel, self.refreshes)
         lagging = self.scene.red_lag_share * (len(self.decays) > 1)
-        kinds = np.array([[1 - lagging, 1, 1], [lagging, 0, 0]])
-        return tuple(self._texture(colours) for colours in kinds[: len(self.decays)])
+        kinds = np.array([[1 - lagging, 1, 1], [lagging, 0, 0]], np.float32)[: len(self.decays)]
+        return [[tuple(self._texture(light * colours) for colours in kinds) for light in lights] for lights in panels]
 
-    def _texture(self, colours: FloatArray) -> Float32Array:
+    def _texture(self, light: Float32Array) -> Float32Array:
         down, across = self.texture_scale
-        light = self.drive.transmittance * colours.astype(np.float32)
         fine = np.repeat(np.repeat(light, down, axis=0), across, axis=1)
         if across > 1:
             _draw_pixel_structure(fine, self.scene.panel)
@@ -186,13 +246,14 @@ def _draw_pixel_structure(fine: Float32Array, depth: float) -> None:
         fine[line::3] *= np.float32(gain)
 
 
-def column_light(exposure: Exposure, x: FloatArray, y: FloatArray) -> Float32Array:
+def column_light(exposure: Exposure, x: FloatArray, y: FloatArray, drive: Drive) -> Float32Array:
     """Electrons that each column's light gives a green pixel behind clear panel, lit for the whole exposure.
 
     Args:
         exposure: the picture to be taken.
         x: (nx,) sensor columns.
         y: (ny,) sensor rows.
+        drive: of the backlight at that time.
 
     Returns:
         (ny, columns, nx) float32.
@@ -202,7 +263,7 @@ def column_light(exposure: Exposure, x: FloatArray, y: FloatArray) -> Float32Arr
     place = exposure.pixels_to_screen(pixels)
     gain = exposure.scene.light_e_per_s * exposure.scene.exposure_s * _vignette(exposure, pixels)
     widths = screen.light_spread, exposure.scene.spread_tails
-    along = light_spread(place[..., 1], screen.segment_rows, *widths) @ exposure.drive.lit_light
+    along = light_spread(place[..., 1], screen.segment_rows, *widths) @ drive.lit_light
     along *= light_spread(place[..., 0], screen.columns, *widths)
     along *= gain[..., None]
     return np.ascontiguousarray(along.transpose(0, 2, 1), np.float32)
@@ -239,9 +300,7 @@ def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
     """Expected light of the sensor rows `top` to `bottom`."""
     sensor, pitch = exposure.scene.sensor, exposure.grid_pitch
     places = _texture_places(exposure, top, bottom)
-    flags: dict[str, int] = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_CONSTANT, "borderValue": 0}
-    images = [np.asarray(cv2.remap(texture, *places, **flags)) for texture in exposure.textures]
-    pictures = tuple(pick_colours(picture, sensor.pattern, top) for picture in images)
+    pictures = tuple(pick_colours(picture, sensor.pattern, top) for picture in exposure.panel(*places, top))
     backlights = []
     for nodes in _backlight_nodes(exposure, grid_nodes(sensor.width, pitch), top, bottom):
         light = cv2.resize(nodes, (nodes.shape[1] * pitch, nodes.shape[0]), interpolation=cv2.INTER_LINEAR)
@@ -270,16 +329,17 @@ def _backlight_nodes(exposure: Exposure, x: FloatArray, top: int, bottom: int) -
     """For each kind of light (rows, nodes) electrons: the columns' light, interpolated along rows, times lit shares."""
     pitch = exposure.grid_rows
     n_cells = -(-(bottom - top) // pitch)
-    light = column_light(exposure, x, top + pitch * np.arange(n_cells + 1.0))
-    pairs = np.concatenate([light[:-1], light[1:]], axis=1)
     share = (np.arange(pitch, dtype=np.float32) / pitch)[None, :, None]
-    found = []
-    for shares in exposure.lit:
-        padded = np.zeros((n_cells * pitch, shares.shape[1]), np.float32)
-        padded[: bottom - top] = shares[top:bottom]
-        lit = padded.reshape(n_cells, pitch, -1)
-        ends = np.concatenate([lit * (1 - share), lit * share], axis=2)
-        found.append(np.matmul(ends, pairs).reshape(n_cells * pitch, -1)[: bottom - top])
+    found = [np.zeros((bottom - top, x.size), np.float32) for _ in exposure.decays]
+    for drive, lit_shares in exposure.lit_by_drive:
+        light = column_light(exposure, x, top + pitch * np.arange(n_cells + 1.0), drive)
+        pairs = np.concatenate([light[:-1], light[1:]], axis=1)
+        for nodes, shares in zip(found, lit_shares, strict=True):
+            padded = np.zeros((n_cells * pitch, shares.shape[1]), np.float32)
+            padded[: bottom - top] = shares[top:bottom]
+            lit = padded.reshape(n_cells, pitch, -1)
+            ends = np.concatenate([lit * (1 - share), lit * share], axis=2)
+            nodes += np.matmul(ends, pairs).reshape(n_cells * pitch, -1)[: bottom - top]
     return found
 
 
@@ -330,7 +390,7 @@ def take_picture(
     raw = np.empty(shape, np.uint16)
     gains = sensor.pixel_gains()
     # Shared by all bands: made once, before threads ask for them.
-    _ = exposure.textures, exposure.lit, exposure.room_rows, exposure.grid_pitch, exposure.grid_rows
+    _ = exposure.textures, exposure.lit_by_drive, exposure.room_rows, exposure.grid_pitch, exposure.grid_rows
     _ = exposure.glare_rows if exposure.scene.glare else None
 
     def work(rows: tuple[int, int]) -> None:

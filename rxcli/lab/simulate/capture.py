@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from rxcli.lab.simulate.bound import Oracle, OracleRecorder
 from rxcli.lab.simulate.camera import Exposure, take_picture
 from rxcli.lab.simulate.files import CODECS, Encoding, encode_jpeg, write_dng, write_png, write_tiff, write_video
+from rxcli.lab.simulate.film import Film, Player
 from rxcli.lab.simulate.isp import develop
 from rxcli.lab.simulate.motion import HandMotion, turned
 from rxcli.lab.simulate.optics import FloatArray, View, homography
-from rxcli.lab.simulate.pictures import load_picture, picture_names
+from rxcli.lab.simulate.pictures import load_picture
 from rxcli.lab.simulate.scenes import Change, Scene
-from rxcli.lab.simulate.transmitter import Dimming, Drive, Link, Weights, drive_screen
+from rxcli.lab.simulate.transmitter import Drive, Link, drive_screen
 from rxcli.lab.simulate.truth import build_truth
-from rxcli.profiles import ScreenProfile
 
 #: Slots before the first row, so that delayed columns already send.
 _LEAD_SLOTS = 8
@@ -80,11 +80,13 @@ class Recording:
     seed: int
     start_slot: float
     delays: FloatArray
+    player: Player | None = None
 
     @property
-    def slot_rate_hz(self) -> float:
-        """Slots per second of the camera's clock."""
-        return self.scene.screen.slot_rate_hz * (1 + self.scene.slot_rate_error_ppm * 1e-6)
+    def at_rest(self) -> "Recording":
+        """The same payloads, noise and camera; the screen shows the film's first picture all the time."""
+        scene, link = replace(self.scene, film=Film()), replace(self.link, weights_of=None)
+        return replace(self, scene=scene, link=link, player=None)
 
     def exposure(self, frame: int = 0) -> Exposure:
         """What frame number `frame` is about to see."""
@@ -92,10 +94,10 @@ class Recording:
         change = max((c for c in scene.changes if c.frame <= frame), key=lambda c: c.frame, default=Change(0))
         blur_px = scene.blur_px if change.blur_px is None else change.blur_px
         scene = replace(scene, light_e_per_s=scene.light_e_per_s * change.light, blur_px=blur_px)
-        sensor, start_slot = scene.sensor, self.start_slot + time_s * self.slot_rate_hz
+        sensor, start_slot = scene.sensor, self.start_slot + time_s * self.scene.real_slot_rate_hz
         view = View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect)
-        clock = start_slot, self.slot_rate_hz, self.delays, time_s
-        return Exposure(scene, view, self.drive, self.link, *clock, motion=self._motion(view))
+        clock = start_slot, scene.real_slot_rate_hz, self.delays, time_s
+        return Exposure(scene, view, self.drive, self.link, *clock, motion=self._motion(view), player=self.player)
 
     def _motion(self, view: View) -> HandMotion | None:
         if not self.scene.hand_px:
@@ -148,23 +150,22 @@ def prepare(scene: Scene, rng: np.random.Generator | int) -> Recording:
     """
     rng = np.random.default_rng(rng)
     link_seed, noise_seed = (int(s) for s in rng.integers(0, 2**62, 2))
-    drive = _drive(scene)
-    link = Link(scene.screen, drive.weights, link_seed, scene.payload, scene.labels, scene.waveform)
-    start = rng.uniform(_LEAD_SLOTS, link.burst_slots) if scene.start_slot is None else scene.start_slot
-    return Recording(scene, drive, link, noise_seed, float(start), _delays(scene, rng))
+    screen, rate_hz = scene.screen, scene.real_slot_rate_hz
+    burst_slots = screen.packet_slots * screen.repeats
+    start = float(rng.uniform(_LEAD_SLOTS, burst_slots) if scene.start_slot is None else scene.start_slot)
+    picture = scene.picture
+    if isinstance(picture, str):
+        picture = load_picture(picture, screen.width_px, screen.height_px)
 
+    def drive_for(picture: NDArray[np.uint8]) -> Drive:
+        return drive_screen(screen, picture, scene.w, scene.dimming, scene.spread_tails)
 
-def _drive(scene: Scene) -> Drive:
-    if not isinstance(scene.picture, str):
-        return drive_screen(scene.screen, scene.picture, scene.w, scene.dimming, scene.spread_tails)
-    drive = _drive_named if scene.picture in picture_names() else _drive_named.__wrapped__
-    return drive(scene.screen, scene.picture, scene.w, scene.dimming, scene.spread_tails)
-
-
-@lru_cache(maxsize=8)
-def _drive_named(screen: ScreenProfile, name: str, weights: Weights, dimming: Dimming, tails: float) -> Drive:
-    """Kept for sweeps, which show the same few pictures over and over."""
-    return drive_screen(screen, load_picture(name, screen.width_px, screen.height_px), weights, dimming, tails)
+    drive, player, weights_of = drive_for(picture), None, None
+    if scene.film.shows:
+        player = Player(scene.film, picture, drive_for, noise_seed, -start / rate_hz, burst_slots / rate_hz)
+        drive, weights_of = player.drive(player.start_number), player.weights_in if scene.w == "dimming" else None
+    link = Link(screen, drive.weights, link_seed, scene.payload, scene.labels, scene.waveform, weights_of)
+    return Recording(scene, drive, link, noise_seed, start, _delays(scene, rng), player)
 
 
 def _delays(scene: Scene, rng: np.random.Generator) -> FloatArray:

@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from rxcli.lab.simulate.film import draw_film
 from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.optics import FloatArray, Lens, Pose, View
 from rxcli.lab.simulate.pictures import DARK_KINDS, PHOTOS, draw_dark_picture, draw_part
@@ -60,6 +61,8 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     frame_rate_hz: float = 29.97
     #: Pixels by which a hand moves the picture from frame to frame.
     hand_px: Range = (0.0, 0.0)
+    #: Kinds of films that screens show, of `FILM_KINDS`; none for pictures at rest.
+    films: tuple[str, ...] = ()
     #: Fields of the scene that are set at last, as in `vlc-rx simulate --set`.
     scene: dict[str, Any] = {}
 
@@ -110,6 +113,8 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         if self.raw and rng.random() < self.raw and scene.sensor.pattern is not None:
             # LibRaw crops the models that it knows.
             scene = replace(scene, output="raw", make="Synthetic", model=scene.camera_name)
+        if self.films:
+            scene = replace(scene, film=draw_film(str(rng.choice(self.films)), rng))
         return with_fields(scene, self.scene), kind
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import UsageError
+from rxcli.lab.simulate.film import Film
 from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.optics import Lens, Pose
 from rxcli.lab.simulate.sensor import Sensor
@@ -58,6 +59,7 @@ class Scene:
     screen: ScreenProfile
     #: Name or path of the picture shown, or (height, width, 3) uint8.
     picture: str | NDArray[np.uint8] = "coffee"
+    film: Film = field(default_factory=Film)
     w: Weights = 5
     dimming: Dimming = "max"
     #: Sent over and over; None for random bits.
@@ -122,6 +124,11 @@ class Scene:
     def is_mosaic(self) -> bool:
         """Whether a frame in memory is the sensor's mosaic; a sensor without filter array is always developed."""
         return self.output == "raw" and self.sensor.cfa != "rgb"
+
+    @property
+    def real_slot_rate_hz(self) -> float:
+        """Slots per second of the camera's clock."""
+        return self.screen.slot_rate_hz * (1 + self.slot_rate_error_ppm * 1e-6)
 
     @property
     def rows_per_slot(self) -> float:
@@ -210,7 +217,7 @@ def with_fields(part: Part, table: Mapping[str, Any], place: str = "") -> Part:
     """A scene, or a part of one, with some fields set; those of a scene's parts stand in tables of their own.
 
     Args:
-        part: scene, sensor, lens, pose, room or isp.
+        part: scene, film, sensor, lens, pose, room or isp.
         table: fields as TOML has them.
         place: the part's name and a dot; nothing for a scene.
 

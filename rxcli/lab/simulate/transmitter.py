@@ -179,16 +179,21 @@ class Link:
     labels: LabelSource | None = None
     #: Light 0..1 by slot number, (n,) of all columns or (columns, n), instead of packets; None for packets.
     waveform: Waveform | None = None
+    #: Lit slots per symbol by burst, where they follow a film; None for `weights` all the time.
+    weights_of: Callable[[int], NDArray[np.int64]] | None = None
 
     @property
     def burst_slots(self) -> int:
         """Slots of one burst."""
         return self.screen.packet_slots * self.screen.repeats
 
-    @cached_property
-    def bits_per_column(self) -> list[int]:
-        """Payload bits of a packet of every column."""
-        return [payload_bits(int(w), self.screen.payload_symbols) for w in self.weights]
+    def weights_in(self, burst: int) -> NDArray[np.int64]:
+        """(columns,) lit slots per symbol of a burst."""
+        return self.weights if self.weights_of is None else self.weights_of(burst)
+
+    def bits_per_column(self, burst: int = 0) -> list[int]:
+        """Payload bits of every column's packet in a burst."""
+        return [payload_bits(int(w), self.screen.payload_symbols) for w in self.weights_in(burst)]
 
     def payload(self, burst: int) -> list[NDArray[np.uint8]]:
         """Payload bits of one burst, per column."""
@@ -196,20 +201,21 @@ class Link:
             # The first bits of every symbol's label, as many as the column's weight carries.
             label = self.labels.labels(np.array([burst]), self.screen.columns, self.screen.payload_symbols)[0]
             sent = ((label[..., None] >> np.arange(LABEL_BITS - 1, -1, -1)) & 1).astype(np.uint8)
-            return [sent[:, c, : bits_per_symbol(int(w))].ravel() for c, w in enumerate(self.weights)]
-        total = sum(self.bits_per_column)
+            return [sent[:, c, : bits_per_symbol(int(w))].ravel() for c, w in enumerate(self.weights_in(burst))]
+        bits_per_column = self.bits_per_column(burst)
+        total = sum(bits_per_column)
         if self.message is None:
             rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, burst])))
             bits = rng.integers(0, 2, total, dtype=np.uint8)
         else:
             message = np.unpackbits(np.frombuffer(self.message, np.uint8))
             bits = np.take(message, np.arange(burst * total, (burst + 1) * total), mode="wrap")
-        return np.split(bits, np.cumsum(self.bits_per_column)[:-1])
+        return np.split(bits, np.cumsum(bits_per_column)[:-1])
 
     def packets(self, burst: int) -> NDArray[np.uint8]:
         """(columns, packet slots) 0/1, one packet of `burst`."""
         bits = self.payload(burst)
-        return np.stack([encode_packet(b, int(w)) for b, w in zip(bits, self.weights, strict=True)])
+        return np.stack([encode_packet(b, int(w)) for b, w in zip(bits, self.weights_in(burst), strict=True)])
 
     def slots(self, start: int, stop: int) -> NDArray[Any]:
         """(columns, stop - start) 0/1 slots from `start` on; dark before slot 0."""

@@ -58,6 +58,7 @@ def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[s
         for number, exposure in enumerate(exposures)
     ]
     bursts = sorted({entry["burst"] for frame in frames for entry in frame["bursts"]})
+    weights = [initial.link.weights_in(burst).tolist() for burst in bursts]
     profile = build_camera_profile(scene, initial)
     camera = msgspec.to_builtins(profile.modes[0]) | msgspec.to_builtins(profile.lens) | {"name": profile.name}
     return {
@@ -65,11 +66,12 @@ def build_truth(scene: Scene, exposures: list[Exposure], capture: str) -> dict[s
         "screen": screen.name,
         **{name: getattr(screen, name) for name in ("columns", "slot_rate_hz", "payload_symbols", "repeats")},
         "camera": camera,
-        "w": initial.link.weights.tolist(),
-        "payload_bits": list(initial.link.bits_per_column),
+        "w": weights[0] if weights else initial.link.weights.tolist(),
+        "payload_bits": initial.link.bits_per_column(bursts[0] if bursts else 0),
         "corners_sensor_px": initial.corners.tolist(),
         "frames": frames,
         "payload": {str(burst): [bits_to_hex(bits) for bits in initial.link.payload(burst)] for burst in bursts},
+        **({"w_of_burst": dict(zip(map(str, bursts), weights, strict=True))} if initial.link.weights_of else {}),
         "orientation": scene.orientation,
         "tone_curve": "linear" if scene.is_mosaic else scene.isp.tone,
         "slot_rate_error_ppm": scene.slot_rate_error_ppm,
