@@ -13,6 +13,9 @@ from rxcli.types import Frame
 
 __all__ = ["KNOWN_SUFFIXES", "MAX_BYTES", "begun", "open_source"]
 
+#: Bytes in which JPEGs in a row show: three at least.
+_ROW_BYTES = 1 << 26
+
 
 def open_source(path: str | Path) -> Generator[Frame, None, None]:
     """Yield the frames of a photo, RAW file, clip or V4L2 device; the source is opened with the first frame.
@@ -46,6 +49,10 @@ def _kind(path: Path) -> Kind | None:
     head = read_bytes(path, HEAD_BYTES)
     check_no_list(path, head)
     kind = sniff(head, path.suffix.lower())
+    if kind == "jpeg":
+        from rxcli.ingest.jpeg import is_row
+
+        return "video" if is_row(read_bytes(path, _ROW_BYTES)) else kind
     if kind == "tiff":
         from rxcli.ingest.metadata import is_raw_tiff
 

@@ -4,11 +4,15 @@ import os
 from pathlib import Path
 
 _TS_SYNC = 0x47
-_EBML, _SEGMENT = b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67"
+#: Elements of Matroska (RFC 9559, section 5): outermost ones, and those in a segment or cluster of unknown size.
+_ELEMENTS = "1a45dfa3 18538067 114d9b74 1549a966 1654ae6b 1f43b675 1c53bb6b 1254c367 ec bf e7 a3 a0 a7 ab"
+_IDS = tuple(map(bytes.fromhex, _ELEMENTS.split()))
+#: Parts that are counted: hours of a recording.
+_MAX_PARTS = 1 << 20
 
 
 def is_cut(path: Path, container: str) -> bool:
-    """Whether a file ends within one of its outermost parts; what is behind the last of them is no part of a clip.
+    """Whether a file ends within one of its parts; what is behind the last of them is no part of a clip.
 
     Args:
         path: the file.
@@ -16,13 +20,16 @@ def is_cut(path: Path, container: str) -> bool:
     """
     if container == "mpegts":
         return _ends_within_packet(path)
-    size_of = box_size if "mp4" in container else _element
+    size_of = box_size if "mp4" in container else _flv_tag if container == "flv" else _element
     part, length = 0, path.stat().st_size
     with path.open("rb") as file:
-        while part < length and (size := size_of(file.read(16))):
+        for _ in range(_MAX_PARTS):
+            size = size_of(file.read(16))
+            if not size or part + size >= length:
+                return part + size > length
             part += size
-            file.seek(min(part, length))
-    return part > length
+            file.seek(part)
+    return False
 
 
 def box_size(head: bytes) -> int:
@@ -33,12 +40,19 @@ def box_size(head: bytes) -> int:
 
 
 def _element(head: bytes) -> int:
-    """Size of an outermost element of Matroska (RFC 8794, sections 4 and 6); 0 where it is not known."""
-    if not head.startswith((_EBML, _SEGMENT)) or len(head) < 16:
-        return 0
-    length = 9 - head[4].bit_length()
-    size = int.from_bytes(head[4 : 4 + length]) & (1 << 7 * length) - 1
-    return 4 + length + size if size + 1 < 1 << 7 * length else 0
+    """Size of an element of Matroska (RFC 8794, sections 4 and 6), of its head alone where its size is not known."""
+    n_id = next((len(known) for known in _IDS if known.startswith(head[: len(known)])), 0)
+    head = head.ljust(16, b"\0")  # of one that is cut
+    n_size = 9 - head[n_id].bit_length()
+    size = int.from_bytes(head[n_id : n_id + n_size]) & (1 << 7 * n_size) - 1
+    return n_id and n_id + n_size + (size if size + 1 < 1 << 7 * n_size else 0)
+
+
+def _flv_tag(head: bytes) -> int:
+    """Size of the header of an FLV file, or of a tag, with the number behind it."""
+    if head.startswith(b"FLV"):
+        return int.from_bytes(head[5:9]) + 4
+    return 11 + int.from_bytes(head[1:4]) + 4 if head[:1] in (b"\x08", b"\x09", b"\x12") else 0
 
 
 def _ends_within_packet(path: Path) -> bool:

@@ -18,21 +18,19 @@ _ENTRY = struct.Struct(">4sBBH")
 _BOXES, _MAX_BYTES = (b"moov", b"udta", b"GPMF"), 1 << 20
 
 
-def stated_readout_s(path: Path, container: Any, options: dict[str, str]) -> float | None:
+def stated_readout_s(path: Path, container: Any) -> float | None:
     """Readout that a clip states, seconds; None where it states none.
 
     Args:
         path: of the clip.
-        container: the opened clip.
-        options: that it was opened with.
+        container: the opened clip, at its beginning.
     """
     tracks = [s.index for s in container.streams.data if s.metadata.get("handler_name", "").strip() == _TRACK]
     if not tracks:
         return None
-    import av
-
-    with av.open(container.name, options=options, metadata_errors="replace") as beside, path.open("rb") as file:
-        in_track = next((bytes(packet) for packet in beside.demux(tracks) if packet.size), b"")
+    in_track = next((bytes(packet) for packet in container.demux(tracks) if packet.size), b"")
+    container.seek(0)
+    with path.open("rb") as file:
         return next((found / 1000 for data in (in_track, _header(file)) for found in _readouts(data)), None)
 
 

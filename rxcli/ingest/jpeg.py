@@ -24,6 +24,8 @@ _FRAMES = (*_SEQUENTIAL, *_PROGRESSIVE, 0xC3, 0xC5, 0xC7, 0xCB, 0xCD, 0xCF)
 _START, _END, _SCAN, _NOTES, _ADOBE = 0xD8, 0xD9, 0xDA, (*range(0xE0, 0xF0), 0xFE), 0xEE
 #: A marker; no padding, no stuffed byte, and no restart within a scan.
 _MARKER = re.compile(rb"\xff[^\x00\x01\xff\xd0-\xd7]")
+#: Where one picture follows another, as streamers write them; cameras list further pictures of a photo (CIPA DC-007).
+_NEXT, _LISTED = re.compile(rb"\xff\xd9[\0\r\n]*\xff\xd8\xff"), b"MPF\0"
 #: Frames from here on are coded arithmetically, which shows no missing end.
 _ARITHMETIC = 0xC9
 #: Coefficients of a block.
@@ -103,6 +105,11 @@ def header_of(data: bytes) -> tuple[int, int, float, bool]:
             is_progressive = marker in _PROGRESSIVE
             held = 1.0 + (2 * n_components if is_progressive else 0)
     return 0, 0, held, False
+
+
+def is_row(data: bytes) -> bool:
+    """Whether bytes that begin with a JPEG picture are three or more in a row: a clip, no photo with a second view."""
+    return len(_NEXT.findall(data)) > 1 and not any(data.startswith(_LISTED, at) for _, at, _ in segments(data))
 
 
 def segments(data: bytes, beyond_scan: bool = False) -> Iterator[tuple[int, int, int]]:

@@ -22,12 +22,14 @@ RAW_SUFFIXES = _suffixes(
 )
 #: Of JPEGs in a row: each begins like a photograph.
 MJPEG_SUFFIXES = _suffixes("mjpeg mjpg")
-VIDEO_SUFFIXES = MJPEG_SUFFIXES | _suffixes("mp4 mov m4v mkv avi webm mts m2ts ts mpg 3gp")
+VIDEO_SUFFIXES = MJPEG_SUFFIXES | _suffixes(
+    "mp4 mov m4v mkv avi webm mts m2ts ts mpg mpeg m2v vob 3gp 3g2 flv asf wmv h264 264 avc h265 265 hevc"
+)
 #: Suffixes, lower case with their dot, of the files that are looked at in folders.
 KNOWN_SUFFIXES = IMAGE_SUFFIXES | RAW_SUFFIXES | VIDEO_SUFFIXES
 
-#: Bytes that `sniff` needs: enough for the file type box of ISO media.
-HEAD_BYTES = 64
+#: Bytes that `sniff` needs: enough for the file type box of ISO media, and the head of a part of HTTP.
+HEAD_BYTES = 256
 #: No camera makes larger pictures; what claims to be larger is damaged or a decompression bomb.
 MAX_PIXELS = 400_000_000
 #: What a reader may hold at a time: the file's bytes, its samples, and the luma made of them.
@@ -51,6 +53,8 @@ _MAGIC: tuple[tuple[int, tuple[bytes, ...], Kind], ...] = (
     (4, (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"moof", b"pnot"), "video"),
     (0, (b"\x1a\x45\xdf\xa3",), "video"),  # Matroska
     (8, (b"AVI",), "video"),
+    (0, (b"FLV\1",), "video"),
+    (0, (b"\0\0\0\1", b"\0\0\1\xb3", b"\0\0\1\xba"), "video"),  # H.264, HEVC, MPEG without a container
 )
 
 
@@ -100,7 +104,7 @@ def read_bytes(path: Path, size: int = -1) -> bytes:
 
 def sniff(head: bytes, suffix: str) -> Kind | None:
     """The kind of a file that starts with `head`; None if neither bytes nor `suffix` identify it."""
-    if suffix in MJPEG_SUFFIXES:
+    if suffix in MJPEG_SUFFIXES or (head.lstrip().startswith(b"--") and b"image/jpeg" in head.lower()):
         return "video"
     by_name: Kind | None = "raw" if suffix in RAW_SUFFIXES else "video" if suffix in VIDEO_SUFFIXES else None
     return next((kind for at, starts, kind in _MAGIC if head.startswith(starts, at)), by_name)

@@ -6,10 +6,12 @@ go to simplejpeg in a few threads here (2.3 to 2.6 times faster). Some frames ar
 
 import errno
 import os
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,8 @@ _CHROMA_RANGE, _BT709 = 224 / 219, 1
 _LOWER_FIRST = (3, 4)
 #: Columns whose rows are compared to see whether a frame is two fields.
 _N_COMPARED = 64
+#: Units of HEVC that hold notes (ITU-T H.265, table 7-1), as FFmpeg leaves them out.
+_NO_SEI = "filter_units=remove_types=39|40"
 #: Frame rates that a stream may state, and the one that is taken where it states none.
 _RATES_HZ, _USUAL_RATE_HZ = (1.0, 1000.0), 30.0
 #: Pictures of MJPEG that are decoded or wait at most, one in each thread and as many before it.
@@ -50,14 +54,18 @@ _N_HELD = 8
 _ALIGNED = 64
 #: Packets whose times are so far from those before, in seconds, are those of another clip that was joined.
 _JOINT_S = 1.0
-#: Times of a clip that are believed: a claim of more would be years.
+#: Times of a clip, from its first frame, that are believed: a claim of more would be years.
 _MAX_S = 1e6
-#: FFmpeg opens this one file and nothing that it names: no other protocol, and containers only, no lists of files.
-_FILES_ONLY = {
-    "protocol_whitelist": "file",
+#: Bytes of a file in which FFmpeg may look for the next packet, and that it asks for at a time.
+_SEARCHED_BYTES, _BUFFER_BYTES = 1 << 27, 1 << 20
+#: FFmpeg reads this one file and nothing that it names: no protocol, and containers only, no lists of files.
+_OPTIONS = {
+    "protocol_whitelist": "none",
     "format_whitelist": "mov,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,mjpeg,mpjpeg,jpeg_pipe,asf,flv",
     # Times that step back where clips were joined are no counter that ran over.
     "correct_ts_overflow": "0",
+    # What is stored is read, at its own time, whatever a player would leave out, repeat or slow down.
+    "ignore_editlist": "1",
 }
 
 
@@ -66,6 +74,8 @@ class _Progress:
     """Progress of reading, which shows at the end whether the clip was complete."""
 
     times: FrameTimes = field(default_factory=FrameTimes)
+    #: Stamp that times are counted from: they may begin at the time of day.
+    origin: int | None = None
     last_time_s: float = 0.0
     #: Time of the last whole frame before the first fault.
     broken_at_s: float | None = None
@@ -80,12 +90,27 @@ class _Progress:
     has_times: bool = True
     #: Whether frames are two fields, one after the other.
     has_fields: bool = False
+    #: Bytes in which the next packet is looked for.
+    n_left: int = 0
 
     def damage(self, reason: str = "") -> None:
         """Count a damaged frame; of the first one, time and reason are kept."""
         self.n_damaged += 1
         if self.broken_at_s is None:
             self.broken_at_s, self.reason = self.last_time_s, reason
+
+
+class _ClipFile(FileIO):
+    """A clip as FFmpeg reads it, which ends where too much of it holds nothing: zeros, for instance."""
+
+    def __init__(self, path: Path, progress: _Progress) -> None:
+        super().__init__(str(path))
+        self._progress, progress.n_left = progress, _SEARCHED_BYTES
+
+    def read(self, size: int | None = 0) -> bytes:
+        data = super().read(min(size or 0, self._progress.n_left)) or b""
+        self._progress.n_left -= len(data)
+        return data
 
 
 def read_video(path: Path) -> Iterator[Frame]:
@@ -102,12 +127,13 @@ def _read(path: Path) -> Generator[Frame, None, None]:
     from av.format import Flags
 
     progress = _Progress()
-    try:
-        # Without a protocol, FFmpeg takes what stands before a colon for one.
-        container = av.open(f"file:{os.path.abspath(path)}", options=_FILES_ONLY, metadata_errors="replace")
-    except (av.error.FFmpegError, ValueError, UnicodeError, OSError) as error:
-        raise InputError(*_open_failure(path, error)) from None
-    with container:
+    with ExitStack() as opened:
+        try:
+            file = opened.enter_context(_ClipFile(path, progress))
+            container = av.open(file, options=_OPTIONS, metadata_errors="replace", buffer_size=_BUFFER_BYTES)
+            opened.enter_context(container)
+        except (av.error.FFmpegError, ValueError, UnicodeError, OSError) as error:
+            raise InputError(*_open_failure(path, error)) from None
         stream = _stream_of(container)
         if stream is None:
             raise InputError(f"{path}: no video in it", "name a clip with pictures")
@@ -140,7 +166,7 @@ def _pixel_bytes(stream: Any) -> float:
 
 def _frames(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
     metadata = clip_metadata(dict(container.metadata) | dict(stream.metadata))
-    metadata = believed(replace(metadata, readout_s=stated_readout_s(path, container, _FILES_ONLY)))
+    metadata = believed(replace(metadata, readout_s=stated_readout_s(path, container)))
     decode = _decode_mjpeg if stream.codec_context.name == "mjpeg" else _decode
     for n_whole, frame in enumerate(decode(path, container, stream, progress)):
         progress.last_time_s = frame.time_s
@@ -174,7 +200,10 @@ def _content(container: Any, stream: Any, progress: _Progress) -> Iterator[Any]:
     is_on = True
     while is_on:
         try:
-            yield from (packet for packet in container.demux(stream) if packet.size)
+            for packet in container.demux(stream):
+                progress.n_left = _SEARCHED_BYTES if progress.n_left else 0
+                if packet.size:
+                    yield packet
             is_on = False
         except IndexError:  # a packet of a stream that begins within the file, which PyAV does not know
             continue
@@ -189,10 +218,11 @@ def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Ite
     max_pixels = int(MAX_BYTES / (_pixel_bytes(stream) * (_N_HELD - 1 + n_threads)))
     # HEVC's decoder passes over faults otherwise.
     codec.options = {"max_pixels": str(max_pixels)} | ({"err_detect": "explode"} if codec.name == "hevc" else {})
+    without_notes = _without_notes(stream) if codec.name == "hevc" else lambda packet: packet
     whole = WholeFrames(codec, n_threads, n_frames - _N_HELD - n_threads)
     try:
         for packet, has_gap in _packets(container, stream, progress):
-            for frame in whole.decode(packet, has_gap=has_gap):
+            for frame in whole.decode(packet and without_notes(packet), has_gap=has_gap):
                 if frame is None:
                     progress.damage()
                 else:
@@ -200,6 +230,21 @@ def _decode(path: Path, container: Any, stream: Any, progress: _Progress) -> Ite
     finally:
         # Threads at work may wait for this one, which would wait for them when it frees the decoder.
         codec.flush_buffers()
+
+
+def _without_notes(stream: Any) -> Callable[[Any], Any]:
+    """Takes the notes (SEI) out of packets of HEVC, and now out of the header: one that cannot be read is no fault."""
+    import av
+    from av.bitstream import BitStreamFilterContext
+
+    notes = BitStreamFilterContext(_NO_SEI, stream, stream)
+
+    def strip(packet: Any) -> Any:
+        with suppress(av.error.FFmpegError, IndexError):
+            return notes.filter(packet)[0]
+        return av.Packet(b"\0")  # damaged
+
+    return strip
 
 
 def _decode_mjpeg(path: Path, container: Any, stream: Any, progress: _Progress) -> Iterator[Frame]:
@@ -224,11 +269,13 @@ def _time_s(stamped: Any, stream: Any, progress: _Progress) -> tuple[float, bool
 
     That is taken where a file gives no time, or one that does not advance: zeros, or times that run backwards.
     """
-    is_stamped = stamped.pts is not None and stream.time_base and progress.has_times
-    own = float(stamped.pts * stream.time_base) if is_stamped else None
-    if own is not None and abs(own) >= _MAX_S:
-        progress.doubt = progress.doubt or f"a frame's time of {own:.6g} s"
-        own = None
+    own = None
+    if stamped.pts is not None and stream.time_base and progress.has_times:
+        progress.origin = stamped.pts if progress.origin is None else progress.origin
+        own = float((stamped.pts - progress.origin) * stream.time_base)
+        if abs(own) >= _MAX_S:
+            progress.doubt = progress.doubt or f"a frame's time of {own:.6g} s"
+            progress.origin, own = stamped.pts, 0.0
     return progress.times.next(own, _frame_s(stream))
 
 

@@ -120,6 +120,47 @@ def with_a_long_last_frame(path: Path) -> Planes:
     return planes
 
 
+def with_edits(path: Path, *edits: tuple[int, int, float]) -> Planes:
+    """A clip with B frames, and how players are to show it: duration in milliseconds, begin in frames, rate."""
+    planes = write_clip(path, container={"use_editlist": "0"}, encoder={"bf": "2"})
+    unit = 15360 // RATE
+
+    def insert(data: bytes) -> bytes:
+        """After the header of the track; the index is the last box of the file."""
+        entries = b"".join(struct.pack(">IiI", ms, begin * unit, int(rate * 65536)) for ms, begin, rate in edits)
+        listed = struct.pack(">I4sII", len(entries) + 16, b"elst", 0, len(edits)) + entries
+        more = struct.pack(">I4s", len(listed) + 8, b"edts") + listed
+        for name in (b"moov", b"trak"):
+            at = data.rindex(name) - 4
+            data = data[:at] + struct.pack(">I", struct.unpack_from(">I", data, at)[0] + len(more)) + data[at + 4 :]
+        at = data.rindex(b"tkhd") - 4
+        end = at + struct.unpack_from(">I", data, at)[0]
+        return data[:end] + more + data[end:]
+
+    changed(path, insert)
+    return planes
+
+
+def with_odd_note(path: Path, codec: str, note: bytes) -> Planes:
+    """A raw stream that holds a note (SEI) of a hundred bytes of which one is there."""
+    planes = write_clip(path, codec)
+    changed(path, lambda data: b"\0\0\0\1" + note + b"\1\x64\xff" + data)
+    return planes
+
+
+def at_the_time_of_day(path: Path, codec: str) -> Planes:
+    clip = path.with_name("clip.mp4")
+    planes = write_clip(clip, codec, *["yuvj420p"] * (codec == "mjpeg"))
+
+    def later(_: int, packet: av.Packet) -> bool:
+        packet.pts += int(1_700_000_000 / packet.time_base)
+        packet.dts += int(1_700_000_000 / packet.time_base)
+        return True
+
+    remuxed(clip, path, later)
+    return planes
+
+
 def with_a_tail(path: Path) -> Planes:
     planes = write_clip(path, "mjpeg", "yuvj420p")
     changed(path, lambda data: data + bytes(300_000))
@@ -141,6 +182,22 @@ KINDS: dict[str, Callable[[Path], Planes]] = {
     "joined_hevc.ts": lambda path: joined(path, "libx265"),
     "joined_mpeg2.ts": lambda path: joined(path, "mpeg2video"),
     "long_last.mkv": with_a_long_last_frame,
+    "trimmed.mp4": lambda path: with_edits(path, (500, 7, 1)),
+    "slowed.mov": lambda path: with_edits(path, (200, 2, 1), (2400, 8, 1 / 8), (200, 17, 1)),
+    "looped.mp4": lambda path: with_edits(path, *[(300, 4, 1)] * 5),
+    "frozen.mov": lambda path: with_edits(path, (400, 2, 1), (5000, 14, 0)),
+    "cut_out.mp4": lambda path: with_edits(path, (200, 2, 1), (200, 18, 1)),
+    "reversed.mp4": lambda path: with_edits(path, (200, 15, 1), (200, 2, 1)),
+    "delayed.mp4": lambda path: with_edits(path, (700, 0, 1)),
+    "cut_to_pieces.mp4": lambda path: with_edits(path, *[(1, 20, 1), (1, 3, 1)] * 200),
+    "note.hevc": lambda path: with_odd_note(path, "libx265", b"\x4e\1"),
+    "last_note.265": lambda path: with_odd_note(path, "libx265", b"\x50\1"),
+    "note.h264": lambda path: with_odd_note(path, "libx264", b"\6"),
+    "time_of_day.mkv": lambda path: at_the_time_of_day(path, "libx264"),
+    "a.flv": lambda path: write_clip(path, "libx264"),
+    "a.mpeg": lambda path: write_clip(path, "mpeg2video", encoder={"b": "9M"}),
+    "row_nameless": jpegs_in_a_row,
+    "parts_nameless": lambda path: jpegs_in_a_row(path, in_parts=True),
     "tail.avi": with_a_tail,
     "tail.mkv": with_a_tail,
     "tail.ts": lambda path: (write_clip(path), changed(path, lambda data: data + bytes(1000)))[0],
@@ -156,7 +213,50 @@ def test_every_frame_the_right_way_up(tmp_path: Path, name: str) -> None:
     for frame, plane in zip(frames, planes, strict=True):
         assert np.abs(frame.pixels.astype(float) - plane).mean() < 8
     assert (np.diff([frame.time_s for frame in frames]) > 0).all()
-    assert [frame.nominal_time for frame in frames[1:]] == ["row" in name or "parts" in name] * (len(frames) - 1)
+    is_nominal = any(part in name for part in ("row", "parts", "note"))
+    assert [frame.nominal_time for frame in frames[1:]] == [is_nominal] * (len(frames) - 1)
+
+
+def test_times_count_from_the_first_frame_and_gaps_stay(tmp_path: Path) -> None:
+    at_the_time_of_day(tmp_path / "a.mkv", "mjpeg")
+    remuxed(tmp_path / "a.mkv", tmp_path / "b.mkv", lambda number, _: number not in (5, 6))
+    frames, _ = read_all(tmp_path / "b.mkv")
+    left = np.delete(np.arange(N_FRAMES), (5, 6))
+    np.testing.assert_allclose([frame.time_s for frame in frames], left / RATE, atol=1.1e-3)
+    assert not frames[-1].metadata.not_believed
+
+
+def test_edits_leave_times_as_they_are(tmp_path: Path) -> None:
+    with_edits(tmp_path / "a.mov", (200, 2, 1), (2400, 8, 1 / 8), (200, 17, 1))
+    frames, _ = read_all(tmp_path / "a.mov")
+    np.testing.assert_allclose([frame.time_s for frame in frames], np.arange(N_FRAMES) / RATE, atol=1e-6)
+
+
+def test_a_photo_with_further_pictures_is_a_photo(tmp_path: Path) -> None:
+    jpegs_in_a_row(tmp_path / "a.jpg")
+    changed(tmp_path / "a.jpg", lambda data: data[:2] + b"\xff\xe2\0\6MPF\0" + data[2:])
+    frames, error = read_all(tmp_path / "a.jpg")
+    assert (len(frames), error) == (1, None)
+
+
+@pytest.mark.parametrize("name", ["a.avi", "a.mkv", "a.flv", "a.h264"])
+def test_a_tail_without_packets_is_read_no_further_than_the_next_could_be(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_clip(tmp_path / name)
+    changed(tmp_path / name, lambda data: data + bytes(1 << 22))
+    monkeypatch.setattr(video, "_SEARCHED_BYTES", 1 << 20)
+    read, sizes = video._ClipFile.read, list[int]()
+
+    def counted(file: Any, size: int) -> bytes:
+        data = read(file, size)
+        sizes.append(len(data))
+        return data
+
+    monkeypatch.setattr(video._ClipFile, "read", counted)
+    frames, error = read_all(tmp_path / name)
+    assert (len(frames), error) == (N_FRAMES, None)
+    assert sum(sizes) < 3 << 20
 
 
 # -- damage ------------------------------------------------------------------------------------------------------------
@@ -223,6 +323,36 @@ def test_a_clip_that_begins_between_key_frames_is_whole_from_the_first_on(tmp_pa
     frames, error = read_all(tmp_path / "later.mkv")
     assert error is None
     assert [frame.pixels.tobytes() for frame in frames] == whole[6:]
+
+
+class Pipe(bytearray):
+    """Takes what is written, and cannot go back to state sizes."""
+
+    name = "a"
+
+    def write(self, data: bytes) -> int:
+        self.extend(data)
+        return len(data)
+
+
+@pytest.mark.parametrize(("form", "options"), [("matroska", {}), ("webm", {"live": "1"}), ("flv", {})], ids=str)
+def test_a_recording_that_is_still_written_breaks_off(tmp_path: Path, form: str, options: dict[str, str]) -> None:
+    pipe = Pipe()
+    with av.open(pipe, "w", format=form, options=options) as container:
+        stream = container.add_stream("libvpx" if form == "webm" else "libx264", rate=RATE)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for picture in pictures():
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "gray").reformat(format="yuv420p")))
+        container.mux(stream.encode())
+    path = tmp_path / "a.bin"
+    path.write_bytes(pipe)
+    frames, error = read_all(path)
+    assert (len(frames), error) == (N_FRAMES, None)
+    for share in (0.4, 0.6, 0.8):
+        path.write_bytes(pipe[: int(len(pipe) * share)])
+        frames, error = read_all(path)
+        assert 0 < len(frames) < N_FRAMES
+        assert f"breaks off at {frames[-1].time_s:.3f} s" in str(error)
 
 
 # -- fields, sizes, times ----------------------------------------------------------------------------------------------
