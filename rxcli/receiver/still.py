@@ -15,7 +15,7 @@ from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel
 from rxcli.receiver.channel import denoise, ratios
 from rxcli.receiver.decode import assemble, detect, survivors
-from rxcli.receiver.decode.settings import QUICK_SURVIVORS
+from rxcli.receiver.decode.settings import GLANCE, QUICK_SURVIVORS
 from rxcli.receiver.decode.settings import SURVIVORS as survivor_settings
 from rxcli.receiver.frame.acquisition import Acquisition, noise_of
 from rxcli.receiver.frame.passes import Reception, dark_columns, packet_llr
@@ -188,14 +188,12 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     metrics = channel.metrics_of(llr_of(lit), 1)
     some = _some(columns)
 
-    def evidence(clock: Clock) -> FloatArray:
-        bursts = _of_weights(ratios.burst_samples(by_start, clock, model, some, lit), alone.w_log_prob[some])
-        return np.asarray(survivors.lane_log_evidence(bursts, QUICK_SURVIVORS).reshape(-1, some.size).sum(axis=0))
+    def of_way(clock: Clock) -> BurstSamples:
+        return _of_weights(ratios.burst_samples(by_start, clock, model, some, lit), alone.w_log_prob[some])
 
-    clock, _ = _ways_by_evidence(acquisition, clock, metrics, evidence)[0]
+    clock, _ = _ways_by_evidence(acquisition, clock, metrics, of_way)[0]
     bursts = _with_weights(of_bursts(clock, lit), alone.w_log_prob)
-    posteriors = survivors.detect(bursts, QUICK_SURVIVORS)
-    free = survivors.free_log_evidence(bursts, QUICK_SURVIVORS)
+    posteriors, free = survivors.detect_against_free(bursts, QUICK_SURVIVORS)
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
     snr = _joint_snr(model.over_black(samples), samples, model, clock)
     # Noise is no evidence, and leaves most symbols open.
@@ -258,8 +256,7 @@ def lateness(acquisition: Acquisition, model: channel.ObservationModel, w_log_pr
     for late in (-step, 0.0, step):
         moved = replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
         parts.append(_joint_samples(replace(acquisition, clock=moved), model, w_log_prob, None)[1])
-    by_lane = survivors.lane_log_evidence(survivors.side_by_side(parts), QUICK_SURVIVORS)
-    early, here, late = by_lane.reshape(len(parts), -1).sum(axis=1).tolist()
+    early, here, late = survivors.log_evidence_of(parts, QUICK_SURVIVORS).sum(axis=1).tolist()
     curvature = early + late - 2 * here
     best = (early - late) / (2 * curvature) if curvature < 0 else np.sign(late - early)
     return step * float(np.clip(best, -1, 1))
@@ -323,20 +320,21 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
     weights = reception.posteriors.w_log_prob[some]
     lit = reception.clock.on_grid(reception.posteriors.lit)
 
-    def evidence(clock: Clock, levels: list[float]) -> FloatArray:
+    def bursts(clock: Clock, level: float) -> BurstSamples:
         samples, model = _view(acquisition, reception, every, STILL.coarse_samples, ratios.by_start(clock))
-        models = (replace(model, black_level=level) for level in levels)
-        parts = [_of_weights(ratios.burst_samples(samples, clock, each, some, lit), weights) for each in models]
-        by_lane = survivors.lane_log_evidence(survivors.side_by_side(parts), QUICK_SURVIVORS)
-        return np.asarray(by_lane.reshape(len(levels), -1, some.size).sum(axis=1))
+        model = replace(model, black_level=level)
+        return _of_weights(ratios.burst_samples(samples, clock, model, some, lit), weights)
+
+    def likeliest(parts: list[BurstSamples]) -> int:
+        return int(survivors.log_evidence_of(parts, GLANCE).sum(axis=1).argmax())
 
     level = reception.model.black_level
     exposed = [_exposed_for(reception.clock, factor) for factor in STILL.exposure_factors]
-    clock = max(exposed, key=lambda clock: float(evidence(clock, [level]).sum()))
+    clock = exposed[likeliest([bursts(clock, level) for clock in exposed])]
     light = reception.samples.light[reception.samples.valid > 0]
     levels = [float(np.percentile(light, STILL.dark_percent)) * share for share in STILL.dark_shares]
-    level = levels[int(evidence(clock, levels).sum(axis=1).argmax())]
-    ways = _ways_by_evidence(acquisition, clock, reception.metrics, lambda way: evidence(way, [level])[0])
+    level = levels[likeliest([bursts(clock, level) for level in levels])]
+    ways = _ways_by_evidence(acquisition, clock, reception.metrics, lambda way: bursts(way, level))
     (best, _), by_evidence = ways[0], [(way.burst, gain) for way, gain in ways]
     refined = replace(
         reception, clock=best, model=replace(reception.model, black_level=level), bursts_by_evidence=by_evidence
@@ -350,13 +348,13 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
 
 
 def _ways_by_evidence(
-    acquisition: Acquisition, clock: Clock, metrics: FloatArray, evidence: Callable[[Clock], FloatArray]
+    acquisition: Acquisition, clock: Clock, metrics: FloatArray, bursts: Callable[[Clock], BurstSamples]
 ) -> list[tuple[Clock, float]]:
     """Assignments of copies to bursts, likeliest first, each with its lead in the log evidence of some columns."""
     ways = [way for way, _ in sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)]
     if len(ways) == 1:
         return [(ways[0], 0.0)]
-    by_column, most = np.stack([evidence(way) for way in ways]), STILL.max_column_gain
+    by_column, most = survivors.log_evidence_of([bursts(way) for way in ways], GLANCE), STILL.max_column_gain
     gains = np.clip(by_column - by_column[0], -most, most).sum(axis=1).tolist()
     return sorted(zip(ways, gains, strict=True), key=lambda way: -way[1])
 

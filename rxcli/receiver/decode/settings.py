@@ -61,3 +61,5 @@ class SurvivorSettings(msgspec.Struct, frozen=True):
 
 
 SETTINGS, SURVIVORS, QUICK_SURVIVORS = DecodeSettings(), SurvivorSettings(), SurvivorSettings(max_paths=12)
+#: Where only ranks are asked.
+GLANCE = SurvivorSettings(max_paths=8)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rxcli.protocol import HEADER, WEIGHTS, bits_per_symbol, codebook, dimming_symbol
 from rxcli.receiver.decode.settings import SURVIVORS
-from rxcli.receiver.decode.survivors import detect, free_log_evidence, lane_log_evidence, side_by_side
+from rxcli.receiver.decode.survivors import detect, detect_against_free, detect_free, log_evidence_of, side_by_side
 from rxcli.receiver.light import exposed_from
 from rxcli.types import BurstSamples
 
@@ -86,8 +86,7 @@ def test_posterior_is_that_of_all_words() -> None:
     )
     log -= np.log(len(WEIGHTS))
     evidence = float(np.logaddexp.reduce(log))
-    twice = lane_log_evidence(side_by_side([burst, burst]), EVERY_PATH)
-    assert twice == pytest.approx(evidence, abs=0.3)
+    assert log_evidence_of([burst, burst], EVERY_PATH) == pytest.approx(evidence, abs=0.3)
     of_five = np.array([value for value, (w, _) in zip(log, paths, strict=True) if w == 5])
     posterior = np.exp(of_five - np.logaddexp.reduce(of_five))
     assert found.w[0] == 5
@@ -105,6 +104,8 @@ def path_log_likelihood(burst: BurstSamples, slots: NDArray[np.int64]) -> float:
         for place in range(Q):
             a, noise = light[n, place], burst.noise[n, place, 0]
             variance = variance + settings.drift_per_slot**2 / Q * picture**2
+            if not burst.valid[n, place].any():
+                continue
             error = burst.light[n, place, 0] - a * picture
             spread = a * a * variance + noise
             total += float((-np.log(spread) / 2 - (nu + 1) / 2 * np.log1p(error**2 / spread / nu)).sum())
@@ -114,6 +115,50 @@ def path_log_likelihood(burst: BurstSamples, slots: NDArray[np.int64]) -> float:
             picture = np.clip(picture + gain * error, 1 / settings.max_picture, settings.max_picture)
             variance = np.maximum(variance * (1 - gain * a), 0)
     return settings.information / Q * total
+
+
+@pytest.mark.parametrize("exposure_slots", [1.0, 2.5])
+def test_evidence_of_arbitrary_slots_is_that_of_all_slots(exposure_slots: float) -> None:
+    """Six slots in view, which see a few more: all of them are tried."""
+    rng = np.random.default_rng(14)
+    burst = samples([packet(np.array([77]), 5)], exposure_slots, rng, 0.06, 0.08)
+    burst.valid[:12] = burst.valid[18:] = 0
+    n_shown = 6 + exposed_from(exposure_slots, Q).shape[1] - 1
+    log = []
+    for number in range(1 << n_shown):
+        slots = np.zeros(40, np.int64)
+        slots[12 : 12 + n_shown] = (number >> np.arange(n_shown)) & 1
+        log.append(path_log_likelihood(burst, slots) - n_shown * np.log(2))
+    for free in (detect_against_free(burst, EVERY_PATH)[1], detect_free(burst, EVERY_PATH)[1]):
+        assert free == pytest.approx(np.logaddexp.reduce(log), abs=0.3)
+
+
+@pytest.mark.parametrize("exposure_slots", [1.1, 4.0])
+def test_a_column_is_detected_the_same_beside_any_other(exposure_slots: float) -> None:
+    """Poor columns have many paths and good ones few; none has a say in another's."""
+    rng = np.random.default_rng(15)
+    parts = [
+        samples([packet(rng.integers(0, 1 << bits_per_symbol(w), 8), w)], exposure_slots, rng, noise, 0.05)
+        for w, noise in ((2, 0.01), (4, 0.3), (5, 0.02), (8, 0.1))
+    ]
+    together = detect(replace(side_by_side(parts), n_bursts=1))
+    for column, part in enumerate(parts):
+        alone = detect(part)
+        assert together.log_evidence[column] == pytest.approx(alone.log_evidence[0], abs=1e-4)
+        assert np.allclose(together.lit[0, column], alone.lit[0, 0], atol=1e-5)
+
+
+def test_bursts_of_other_copies_and_exposures_are_weighed_side_by_side() -> None:
+    rng = np.random.default_rng(16)
+    sent = [packet(rng.integers(0, 128, 5), 5) for _ in range(3)]
+    one, longer = (samples(sent, exposure_slots, rng, 0.02, 0.05) for exposure_slots in (3.6, 4.4))
+    light, noise, valid, neighbours = (
+        np.concatenate([values, values], axis=3) for values in (one.light, one.noise, one.valid, one.neighbours)
+    )
+    twice = replace(one, light=light, noise=noise, valid=valid, neighbours=neighbours, own=np.tile(one.own, 2))
+    parts = [one, twice, longer]
+    apart = np.concatenate([log_evidence_of([part], EVERY_PATH) for part in parts])
+    assert np.allclose(log_evidence_of(parts, EVERY_PATH), apart, atol=0.01)
 
 
 def test_a_symbol_that_nothing_shows_is_open() -> None:
@@ -157,10 +202,10 @@ def test_few_paths_are_enough_and_packets_beat_arbitrary_slots() -> None:
     burst = samples([packet(i, 5) for i in index], 4.0, rng, 0.02, 0.05)
     few, many = detect(burst), detect(burst, msgspec.structs.replace(SURVIVORS, max_paths=300))
     assert np.array_equal(few.index, many.index)
-    assert (few.log_evidence > free_log_evidence(burst)).all()
+    assert (few.log_evidence > detect_against_free(burst)[1]).all()
     other = rng.integers(0, 2, (4, 80)).astype(np.int64)
     noise = samples([np.concatenate([slots, HEADER]) for slots in other], 4.0, rng, 0.02, 0.05)
-    assert (detect(noise).log_evidence < free_log_evidence(noise)).all()
+    assert (detect(noise).log_evidence < detect_against_free(noise)[1]).all()
 
 
 @pytest.mark.parametrize("exposure_slots", [1.1, 6.0])
