@@ -105,6 +105,7 @@ class _ClipFile(FileIO):
 
     def __init__(self, path: Path, progress: _Progress) -> None:
         super().__init__(str(path))
+        self.name = ""  # FFmpeg would take some for patterns of other names
         self._progress, progress.n_left = progress, _SEARCHED_BYTES
 
     def read(self, size: int | None = 0) -> bytes:
