@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from ingest_files import BAYER, write_dng, write_palette_clip, write_sizes
 from numpy.typing import NDArray
-from odd_stills import odd_jpegs, odd_pngs, odd_tiffs
+from odd_stills import odd_jpegs, odd_pngs, odd_tiffs, orientations, uncommon_jpegs
 from small_frames import write_frame, write_profiles
 
 from rxcli.resources import data_dir
@@ -167,6 +167,7 @@ def make_samples(folder: Path, picture: NDArray[np.uint8]) -> dict[str, bytes]:
 
 def _write_stills(folder: Path, picture: NDArray[np.uint8]) -> None:
     import cv2
+    import imagecodecs
     import tifffile
     from PIL import Image
 
@@ -188,7 +189,13 @@ def _write_stills(folder: Path, picture: NDArray[np.uint8]) -> None:
 
         pillow_heif.from_pillow(image).save(str(folder / "a.heic"))
     write_dng(folder / "a.dng", picture[..., 1].astype(np.uint16) * 16, BAYER)
-    for suffix, files in (("jpg", odd_jpegs(picture)), ("png", odd_pngs(picture)), ("tif", odd_tiffs(picture))):
+    luma = np.ascontiguousarray(picture[..., 1])
+    (folder / "a.jxl").write_bytes(imagecodecs.jpegxl_encode(picture))
+    image.save(folder / "a.avif", exif=exif)
+    for name, data in orientations(picture).items():
+        (folder / name).write_bytes(data)
+    jpegs = odd_jpegs(picture) | uncommon_jpegs(luma)
+    for suffix, files in (("jpg", jpegs), ("png", odd_pngs(picture)), ("tif", odd_tiffs(picture))):
         for name, data in files.items():
             (folder / f"{name}.{suffix}").write_bytes(data[0] if isinstance(data, tuple) else data)
 

@@ -6,6 +6,7 @@ import zlib
 from typing import Any
 
 import cv2
+import imagecodecs
 import numpy as np
 import simplejpeg
 import tifffile
@@ -150,6 +151,136 @@ def odd_tiffs(picture: NDArray[np.uint8]) -> dict[str, bytes]:
                 tiff.write(pixels, metadata=None, **options)
         files[name] = out.getvalue()
     return files
+
+
+def tiff_header(*entries: tuple[int, int, int, bytes], order: str = "<") -> bytes:
+    """A TIFF header and one directory of `entries`: tag, type, number, and the field of four bytes."""
+    rows = [struct.pack(order + "HHI4s", *entry) for entry in entries]
+    head = struct.pack(order + "2sHI", b"II" if order == "<" else b"MM", 42, 8)
+    return head + struct.pack(order + "H", len(rows)) + b"".join(rows) + bytes(4)
+
+
+def xmp(body: str) -> str:
+    names = 'xmlns:tiff="http://ns.adobe.com/tiff/1.0/" xmlns:exif="http://ns.adobe.com/exif/1.0/"'
+    start = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    return f"{start}<rdf:Description {names} {body}</rdf:RDF></x:xmpmeta>"
+
+
+#: XMP that states orientation 3, by the way in which it does.
+XMP = {
+    "attribute": xmp('tiff:Orientation="3"/>'),
+    "single_quotes": xmp("tiff:Orientation = '3'/>"),
+    "element": xmp("><tiff:Orientation>3</tiff:Orientation></rdf:Description>"),
+}
+
+
+def orientations(picture: NDArray[np.uint8]) -> dict[str, bytes]:
+    """Files of orientation 3 by name: JPEGs, PNGs and TIFFs that state it as few programs do."""
+    short, software = (0x0112, 3, 1, b"\3\0\0\0"), tiff_header((0x0131, 2, 4, b"abc\0"))
+    exif = {
+        "byte": [tiff_header((0x0112, 1, 1, b"\3\0\0\0"))],
+        "ascii": [tiff_header((0x0112, 2, 2, b"3\0\0\0"))],
+        "undefined": [tiff_header((0x0112, 7, 1, b"\3\0\0\0"))],
+        "long": [tiff_header((0x0112, 4, 1, b"\0\0\0\3"), order=">")],
+        "two_values": [tiff_header((0x0112, 3, 2, b"\3\0\3\0"))],
+        "twice": [tiff_header(short, (0x0112, 3, 1, b"\1\0\0\0"))],
+        "once_nonsense": [tiff_header((0x0112, 3, 1, b"\x63\0\0\0"), short)],
+        "byte_order_mark": [b"\xef\xbb\xbf" + tiff_header(short)],
+        "of_program_first": [software, tiff_header(short)],
+        "of_program_last": [tiff_header(short), software],
+    }
+    blocks = {name: [EXIF_HEAD + part for part in parts] for name, parts in exif.items()}
+    blocks |= {f"xmp_{name}": [b"http://ns.adobe.com/xap/1.0/\0" + text.encode()] for name, text in XMP.items()}
+    blocks["xmp_utf_16"] = [XMP["element"].encode("utf-16")]
+    blocks["xmp_after_exif"] = [EXIF_HEAD + software, *blocks["xmp_attribute"]]
+    jpeg = grey_jpeg(picture[..., 1])
+    files = {
+        f"{name}.jpg": jpeg[:2] + b"".join(segment(0xE1, part) for part in parts) + jpeg[2:]
+        for name, parts in blocks.items()
+    }
+    good, block = cv2.imencode(".png", picture[..., ::-1])[1].tobytes(), tiff_header(short)
+    hexadecimal = b"\nexif\n%8d\n%s\n" % (len(EXIF_HEAD + block), (EXIF_HEAD + block).hex("\n", 36).encode())
+    text, profile = XMP["attribute"].encode(), b"Raw profile type exif\0"
+    chunks = {
+        "raw_profile": (b"zTXt", profile + b"\0" + zlib.compress(hexadecimal)),
+        "raw_profile_plain": (b"tEXt", profile + hexadecimal),
+        "raw_profile_international": (b"iTXt", profile + b"\1\0\0\0" + zlib.compress(hexadecimal)),
+        "xmp": (b"iTXt", b"XML:com.adobe.xmp\0\0\0\0\0" + text),
+        "xmp_packed": (b"iTXt", b"XML:com.adobe.xmp\0\1\0\0\0" + zlib.compress(text)),
+        "property": (b"tEXt", b"exif:Orientation\x003"),
+        "named": (b"eXIf", EXIF_HEAD + block),
+        "other_kind": (b"exIf", block),
+    }
+    for name, (kind, data) in chunks.items():
+        chunk = struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for place, at in (("", 33), ("_last", len(good) - 12)):
+            files[f"{name}{place}.png"] = good[:at] + chunk + good[at:]
+    out = io.BytesIO()
+    with tifffile.TiffWriter(out) as tiff:
+        tiff.write(picture[::8, ::8], subfiletype=_REDUCED, metadata=None)
+        tiff.write(picture, metadata=None, photometric="rgb", extratags=[(274, "H", 1, 3, True)])
+    files["second_page.tif"] = out.getvalue()
+    out = io.BytesIO()
+    tifffile.imwrite(out, picture, metadata=None, photometric="rgb", extratags=[(700, "B", len(text), text, True)])
+    return files | {"xmp.tif": out.getvalue()}
+
+
+def uncommon_jpegs(luma: NDArray[np.uint8]) -> dict[str, bytes]:
+    """JPEG files of more than 8 bits, or without loss, or whose height stands at their end."""
+    deep, plain = luma.astype(np.uint16) * 16, grey_jpeg(luma)
+    height, scan_end = plain.index(b"\xff\xc0") + 5, len(plain) - 2
+    kinds = {"deep": {}, "lossless": {"lossless": True}}
+    files = {
+        f"{name}_{pixels.ndim}": imagecodecs.jpeg8_encode(pixels, bitspersample=12, **options)
+        for name, options in kinds.items()
+        for pixels in (deep, np.repeat(deep[..., None], 3, axis=2))
+    }
+    files |= {"jpeg_ls": imagecodecs.jpegls_encode(luma), "lossless_8": imagecodecs.jpeg8_encode(luma, lossless=True)}
+    files["jpeg_ls_deep"] = imagecodecs.jpegls_encode(luma.astype(np.uint16) * 257)
+    number = struct.pack(">HHH", 0xFFDC, 4, len(luma))
+    files["height_last"] = plain[:height] + bytes(2) + plain[height + 2 : scan_end] + number + plain[scan_end:]
+    return files
+
+
+def tiled_avif(luma: NDArray[np.uint8]) -> bytes:
+    """An AVIF of two by two tiles, each a picture of its own (ISO/IEC 23008-12, 6.6.2.3)."""
+
+    def box(kind: bytes, *parts: bytes, full: bool = False) -> bytes:
+        content = bytes(4 * full) + b"".join(parts)
+        return struct.pack(">I4s", 8 + len(content), kind) + content
+
+    height, width = (side // 2 for side in luma.shape)
+    tiles, configuration = [], b""
+    for top, left in ((0, 0), (0, width), (height, 0), (height, width)):
+        out = io.BytesIO()
+        Image.fromarray(luma[top : top + height, left : left + width]).save(out, "AVIF", quality=95)
+        data = out.getvalue()
+        tiles.append(data[data.index(b"mdat") + 4 :])
+        at = data.index(b"av1C")
+        configuration = data[at - 4 : at - 4 + int.from_bytes(data[at - 4 : at])]
+    grid = struct.pack(">BBBBHH", 0, 0, 1, 1, 2 * width, 2 * height)
+    parts, numbers = [grid, *tiles], range(1, 6)
+    kinds = [box(b"infe", b"\2\0\0\0" + struct.pack(">HH4sx", n, 0, b"grid" if n == 1 else b"av01")) for n in numbers]
+    sizes = [box(b"ispe", struct.pack(">II", w, h), full=True) for w, h in ((2 * width, 2 * height), (width, height))]
+    depth = box(b"pixi", b"\1\x08", full=True)
+    owned = [struct.pack(">HB", n, 2) + (b"\1\4" if n == 1 else b"\2\x83") for n in numbers]
+    properties = box(b"ipco", sizes[0], sizes[1], configuration, depth)
+    linked = box(b"ipma", struct.pack(">I", 5), *owned, full=True)
+
+    def meta(start: int) -> bytes:
+        places, at = [], start
+        for number, part in zip(numbers, parts, strict=True):
+            places.append(struct.pack(">HHHII", number, 0, 1, at, len(part)))
+            at += len(part)
+        handler = box(b"hdlr", bytes(4), b"pict", bytes(13), full=True)
+        found = box(b"iloc", b"\x44\0", struct.pack(">H", 5), *places, full=True)
+        named = box(b"iinf", struct.pack(">H", 5), *kinds, full=True)
+        of_grid = box(b"iref", box(b"dimg", struct.pack(">HH4H", 1, 4, 2, 3, 4, 5)), full=True)
+        first = box(b"pitm", struct.pack(">H", 1), full=True)
+        return box(b"meta", handler, first, found, named, of_grid, box(b"iprp", properties, linked), full=True)
+
+    head = box(b"ftyp", b"mif1", bytes(4), b"avifmif1miaf")
+    return head + meta(len(head) + len(meta(0)) + 8) + box(b"mdat", *parts)
 
 
 def bomb_tiff(compression: int, part: bytes, n_parts: int = 1, tile_px: int = 0) -> bytes:

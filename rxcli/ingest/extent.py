@@ -77,17 +77,16 @@ class Directories:
         values = [[self._values(d, tag) for tag in pair] for d in self._found.values() for pair in _PARTS]
         return max((a + n for at, size in values for a, n in zip(at, size, strict=False)), default=0)
 
-    def tags(self) -> tuple[dict[int, Any], dict[int, Any]]:
-        """Values of the first directory and of its EXIF directory, by tag; empty where they claim too much.
+    def tags(self) -> list[tuple[int, Any]]:
+        """Tags and values of the EXIF directory of the first one, and of that one; none where they claim too much.
 
         Numbers, bytes, or tuples of several numbers.
         """
         if self.claims_too_much:
-            return {}, {}
+            return []
         main = next(iter(self._found.values()), [])
         exif = [entry for at in self._values(main, _EXIF)[:1] for entry in self._found.get(at, [])]
-        of_main, of_exif = ({entry[0]: self._value(entry) for entry in part} for part in (main, exif))
-        return of_main, of_exif
+        return [(entry[0], self._value(entry)) for entry in (*exif, *main)]
 
     def values(self, tag: int) -> set[int]:
         """Values of a tag in all directories."""

@@ -5,7 +5,6 @@ here, because rows must stay in readout order.
 """
 
 import io
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from rxcli.errors import InputError
 from rxcli.ingest.luma import BT601, BT709, Weights
-from rxcli.ingest.metadata import exif_metadata
+from rxcli.ingest.metadata import exif_metadata, turned
 from rxcli.ingest.orientation import PROBE, as_stored, orientation_of
 from rxcli.ingest.sniff import check_size, damage_explained
 from rxcli.types import Metadata
@@ -37,17 +36,14 @@ def read_heif(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]
         raise InputError(f"{path}: HEIC needs an extra", "run `pip install '.[web]'`, or save as JPEG") from None
     with damage_explained(f"{path}: the HEIC picture is damaged", "copy the file again"):
         file = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
-        turned = _orientation(file[file.primary_index])
+        orientation = _orientation(file[file.primary_index])
         width, height = file.size
-        check_size(path, width, height, _bytes_a_pixel(file, turned != 1), len(data))
+        check_size(path, width, height, _bytes_a_pixel(file, orientation != 1), len(data))
         pixels = np.asarray(file)
     matrix = (file.info.get("nclx_profile") or {}).get("matrix_coefficients")
-    metadata = exif_metadata(file.info.get("exif") or b"")
-    if metadata.orientation not in (1, turned):
-        doubt = f"EXIF orientation {metadata.orientation} (HEIC has rotations of its own; columns may be reversed)"
-        metadata = replace(metadata, not_believed=(*metadata.not_believed, doubt))
+    metadata = exif_metadata(*(file.info.get(kind) or b"" for kind in ("exif", "xmp")))
     weights = BT709 if matrix == _MATRIX_BT709 else BT601
-    return as_stored(pixels, turned), replace(metadata, orientation=turned), weights
+    return as_stored(pixels, orientation), turned(metadata, orientation), weights
 
 
 def _bytes_a_pixel(file: Any, is_turned: bool) -> float:

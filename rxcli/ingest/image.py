@@ -8,6 +8,7 @@ import logging
 import re
 import struct
 import warnings
+import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -20,10 +21,10 @@ from numpy.typing import NDArray
 
 from rxcli.errors import InputError
 from rxcli.ingest.extent import Directories
-from rxcli.ingest.luma import BT601, Luma, Weights, colours_of, luma_of
-from rxcli.ingest.metadata import exif_metadata, jpeg_metadata, tiff_metadata
+from rxcli.ingest.luma import BT601, THINNED, Luma, Weights, colours_of, luma_of
+from rxcli.ingest.metadata import ORIENTATION, exif_metadata, jpeg_metadata, orientation_of_tag, tiff_metadata
 from rxcli.ingest.quiet import quiet_libraries
-from rxcli.ingest.sniff import Kind, check_size, damage_explained, read_bytes
+from rxcli.ingest.sniff import Kind, check_size, damage_explained, read_bytes, start_of_picture
 from rxcli.types import Frame, Metadata
 
 
@@ -37,12 +38,13 @@ def read_image(path: Path, kind: Kind) -> Frame:
         return _read_tiff(path)
     data = read_bytes(path)
     if kind == "jpeg":
-        from rxcli.ingest import jpeg
-
-        frame = _frame(path, jpeg.decode_luma(data, path), jpeg_metadata(data))
-        return replace(frame, colours=jpeg.colours_of(data))
+        return _read_jpeg(data[start_of_picture(data) :], path)
     if kind == "png":
-        return _read_png(data, path)
+        return _read_png(data[start_of_picture(data) :], path)
+    if kind == "jxl":
+        from rxcli.ingest.jxl import read_jxl
+
+        return _colour_frame(path, *read_jxl(data, path))
     if kind == "heif":
         from rxcli.ingest.heif import read_heif
 
@@ -60,10 +62,21 @@ def _colour_frame(path: Path, rgb: NDArray[Any], metadata: Metadata, weights: We
     return replace(_frame(path, luma_of(rgb, weights), metadata), colours=colours_of(rgb, weights))
 
 
+def _read_jpeg(data: bytes, path: Path) -> Frame:
+    from rxcli.ingest import jpeg
+
+    data, metadata = jpeg.with_height(data), jpeg_metadata(data)
+    if jpeg.header_of(data).is_uncommon:
+        pixels, white = jpeg.decode_uncommon(data, path)
+        return replace(_colour_frame(path, pixels, metadata), white=white)
+    return replace(_frame(path, jpeg.decode_luma(data, path), metadata), colours=jpeg.colours_of(data))
+
+
 #: ISO 15948, table 11.1: samples of a pixel as they are decoded, by colour type; others may get an alpha.
 _PNG_SAMPLES = {0: 1, 4: 2}
-#: A chunk of EXIF, where it is no chance in compressed data.
-_PNG_EXIF = re.compile(rb"eXIf(?=II\*\0|MM\0\*)")
+#: Start of Deflate within a chunk, and a block of EXIF or XMP in the hexadecimal digits that programs write as text.
+_DEFLATE, _DIGITS = re.compile(rb"x[\x01\x5e\x9c\xda]"), re.compile(rb"\n\w+\s+\d+\n([0-9a-fA-F\s]+)")
+_MAX_CHUNK_BYTES = 1 << 20
 
 
 def _read_png(data: bytes, path: Path) -> Frame:
@@ -76,8 +89,24 @@ def _read_png(data: bytes, path: Path) -> Frame:
     check_size(path, width, height, held, 2 * len(data))
     with damage_explained(f"{path}: the PNG is damaged or cut", "copy the file again"), quiet_libraries():
         pixels = imagecodecs.png_decode(data)
-    exif = _PNG_EXIF.search(data)
-    return _colour_frame(path, pixels, exif_metadata(data[exif.end() :] if exif else b""))
+    return _colour_frame(path, pixels, exif_metadata(*_png_blocks(data)))
+
+
+def _png_blocks(data: bytes) -> Iterator[bytes]:
+    """What the chunks beside the pixels hold, unfolded: EXIF and XMP are known by their content."""
+    at = 8
+    while at + 8 < len(data):
+        size, kind = struct.unpack_from(">I4s", data, at)
+        content, at = data[at + 8 : at + 8 + size], at + 12 + size
+        if kind == b"IDAT" or size > _MAX_CHUNK_BYTES:
+            continue
+        if packed := _DEFLATE.search(content):
+            with suppress(zlib.error):
+                content = zlib.decompressobj().decompress(content[packed.start() :], _MAX_CHUNK_BYTES)
+        digits = _DIGITS.search(content)
+        with suppress(ValueError):  # half a byte
+            content = bytes.fromhex(digits[1].decode()) if digits else content
+        yield content
 
 
 #: TIFF 6.0 and its supplements: compressions whose libraries write no more than they are given room for, and JPEG.
@@ -88,6 +117,8 @@ _MIN_IS_WHITE, _PALETTE, _PHOTOMETRICS, _YCBCR = 0, 3, (0, 1, 2, 3), 6
 _PACKED_BITS = 16
 #: Thumbnails and masks, as flags of NewSubfileType.
 _REDUCED_OR_MASK = 1 | 4
+#: Share of the samples that a screen exceeds by far, and how far above the others few samples count.
+_FEW, _FAR = 1e-3, 4.0
 #: Pages of a file that are looked at, and bytes that are read of one at a time.
 _MAX_PAGES, _READ_BYTES = 32, 1 << 20
 
@@ -103,6 +134,8 @@ def _read_tiff(path: Path) -> Frame:
     with damage_explained(f"{path}: the TIFF is damaged or cut", "copy it again"), tifffile.TiffFile(path) as tiff:
         page = _picture_page(tiff)
         _check_page(page, path)
+        own = orientation_of_tag(page.tags.valueof(ORIENTATION))
+        metadata = replace(metadata, orientation=own or metadata.orientation)
         step = "copy it again" if page.compression == 1 else "copy it again, or save it uncompressed"
         with damage_explained(f"{path}: the TIFF cannot be read", step):
             pixels = page.asarray(maxworkers=1, buffersize=_READ_BYTES)
@@ -136,7 +169,7 @@ def _check_page(page: Any, path: Path) -> None:
     if not (kinds and page.photometric in (*_PHOTOMETRICS, *[_YCBCR] * is_jpeg)) or page.dtype is None:
         reason = f"{path}: the TIFF holds {photometric} samples of {bits} bits (axes {page.axes})"
         raise InputError(reason, "save one plain picture, grey or RGB, with 8 or 16 bits a sample")
-    if page.compression not in _COMPRESSIONS or (is_jpeg and bits > 8):
+    if page.compression not in _COMPRESSIONS:
         reason = f"{path}: the TIFF's compression is {compression} of {bits} bits"
         raise InputError(reason, "save it uncompressed, or with LZW or Deflate")
     size, samples = page.dtype.itemsize, max(page.samplesperpixel, 1)
@@ -157,7 +190,8 @@ def _jpeg_sizes(page: Any) -> Iterator[tuple[int, int]]:
 
     for at, length in zip(page.dataoffsets, page.databytecounts, strict=False):
         page.parent.filehandle.seek(at)
-        yield header_of(page.parent.filehandle.read(length))[:2]
+        header = header_of(page.parent.filehandle.read(length))
+        yield header.width, header.height
 
 
 def _tiff_luma(pixels: NDArray[Any], path: Path) -> tuple[Luma, bool]:
@@ -167,8 +201,9 @@ def _tiff_luma(pixels: NDArray[Any], path: Path) -> tuple[Luma, bool]:
     if pixels.dtype in (np.uint8, np.uint16):
         return luma_of(pixels), False
     if pixels.dtype == np.uint32:  # software fills either end of 32 bits: take the upper 16 in use
-        bits = int(pixels.max(initial=0)).bit_length()
-        return luma_of((pixels >> max(bits - 16, 0) << max(16 - bits, 0)).astype(np.uint16)), False
+        bits = int(_brightest(pixels)).bit_length()
+        shared = np.minimum(pixels, np.uint32((1 << bits) - 1))
+        return luma_of((shared >> max(bits - 16, 0) << max(16 - bits, 0)).astype(np.uint16)), False
     if pixels.dtype.kind != "f":
         raise InputError(f"{path}: TIFF samples of type {pixels.dtype}", "save it with 8 or 16 bits a sample")
     light = luma_of(_light_of(pixels))
@@ -177,22 +212,31 @@ def _tiff_luma(pixels: NDArray[Any], path: Path) -> tuple[Luma, bool]:
 
 def _light_of(pixels: NDArray[Any]) -> NDArray[np.float32]:
     """Float samples as shares of the brightest one; what is no number is dark."""
-    finite = np.isfinite(pixels)
-    top = float(np.max(pixels, initial=0.0, where=finite)) or 1.0
     light = np.zeros(pixels.shape, np.float32)
-    np.divide(pixels, pixels.dtype.type(top), out=light, where=finite, casting="same_kind")
+    with np.errstate(over="ignore"):
+        top = pixels.dtype.type(_brightest(pixels) or 1.0)
+        np.divide(pixels, top, out=light, where=np.isfinite(pixels), casting="same_kind")
     return light
 
 
+def _brightest(pixels: NDArray[Any]) -> float:
+    """The largest sample; of few that are far above all others, the largest that leaves the others their levels."""
+    thinned = pixels[::THINNED, ::THINNED]
+    usual = np.quantile(thinned[np.isfinite(thinned)], 1 - _FEW) if np.isfinite(thinned).any() else 0.0
+    top = float(np.max(pixels, initial=0, where=np.isfinite(pixels)))
+    return min(top, _FAR * float(usual)) if usual > 0 else top
+
+
 def _read_with_pillow(data: bytes, path: Path) -> tuple[NDArray[np.uint8], Metadata]:
-    """BMP, WebP: rare for a camera, but messengers send them."""
+    """AVIF, BMP, WebP: rare for a camera, but messengers send them. AVIF's own turns come as EXIF orientation."""
     from PIL import Image
 
     with (
         damage_explained(f"{path}: the picture is damaged", "copy the file again"),
         warnings.catch_warnings(action="ignore"),  # sizes are checked here, and broken directories do no harm
-        Image.open(io.BytesIO(data), formats=("BMP", "WEBP")) as image,
+        Image.open(io.BytesIO(data), formats=("AVIF", "BMP", "WEBP")) as image,
     ):
         check_size(path, *image.size, 18, len(data))  # measured: WebP without loss takes most
         pixels = np.asarray(image if image.mode in ("L", "RGB") else image.convert("RGB"))
-        return np.asarray(pixels, np.uint8), exif_metadata(image.info.get("exif") or b"")
+        blocks = (image.info.get(kind) or b"" for kind in ("exif", "xmp"))
+        return np.asarray(pixels, np.uint8), exif_metadata(*blocks)

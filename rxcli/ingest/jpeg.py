@@ -4,7 +4,7 @@ import re
 import struct
 import tempfile
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,12 @@ from rxcli.types import Colours, Float32Array
 #: What simplejpeg raises.
 _FAULTS = (ValueError, KeyError, MemoryError, OverflowError)
 #: ITU-T T.81, table B.1: starts of frames (sequential ones, and progressive ones, whose coefficients come in several
-#: scans), of the picture and of a scan; its end; notes of programs, and Adobe's.
+#: scans), of the picture and of a scan; its end; notes of programs, and Adobe's. T.87: start of a JPEG-LS frame.
 _SEQUENTIAL, _PROGRESSIVE = (0xC0, 0xC1, 0xC9), (0xC2, 0xC6, 0xCA, 0xCE)
-_FRAMES = (*_SEQUENTIAL, *_PROGRESSIVE, 0xC3, 0xC5, 0xC7, 0xCB, 0xCD, 0xCF)
+_JPEG_LS = 0xF7
+_FRAMES = (*_SEQUENTIAL, *_PROGRESSIVE, 0xC3, 0xC5, 0xC7, 0xCB, 0xCD, 0xCF, _JPEG_LS)
+#: B.2.5: the segment behind the first scan that states the height where the frame's header states none.
+_HEIGHT = re.compile(rb"\xff\xdc\x00\x04(..)", re.DOTALL)
 _START, _END, _SCAN, _NOTES, _ADOBE = 0xD8, 0xD9, 0xDA, (*range(0xE0, 0xF0), 0xFE), 0xEE
 #: A marker; no padding, no stuffed byte, and no restart within a scan.
 _MARKER = re.compile(rb"\xff[^\x00\x01\xff\xd0-\xd7]")
@@ -28,6 +31,8 @@ _MARKER = re.compile(rb"\xff[^\x00\x01\xff\xd0-\xd7]")
 _NEXT, _LISTED = re.compile(rb"\xff\xd9[\0\r\n]*\xff\xd8\xff"), b"MPF\0"
 #: Frames from here on are coded arithmetically, which shows no missing end.
 _ARITHMETIC = 0xC9
+#: Bits a sample of photographs.
+_BITS = 8
 #: Coefficients of a block.
 _BLOCK = 64
 #: OpenCV's flags for a picture in colour: the means of blocks of eight by eight pixels, and all of it.
@@ -39,6 +44,25 @@ _MAX_SCANS, _MAX_SEGMENTS = 100, 1 << 14
 _SURPLUS = re.compile(r"Corrupt JPEG data: (\d+) extraneous bytes before marker 0xd9")
 #: Bytes that the decoder may have read ahead when it counts the surplus.
 _READ_AHEAD = 16
+
+
+class Header(NamedTuple):
+    """What the headers of a JPEG state; width and height are zero where there is no scan."""
+
+    width: int
+    height: int
+    #: Bits a sample.
+    precision: int = _BITS
+    #: Marker of the frame.
+    marker: int = 0
+    #: Bytes a pixel that decoding takes.
+    held: float = 1.0
+    is_one_scan: bool = False
+
+    @property
+    def is_uncommon(self) -> bool:
+        """Whether it is JPEG-LS, or of another number of bits than photographs."""
+        return self.precision != _BITS or self.marker == _JPEG_LS
 
 
 def decode_luma(data: Any, source: object, at_once: int = 1) -> NDArray[np.uint8]:
@@ -53,18 +77,51 @@ def decode_luma(data: Any, source: object, at_once: int = 1) -> NDArray[np.uint8
         InputError: truncated (with the number of rows), damaged, or no JPEG.
     """
     data = bytes(data)
-    width, height, held, is_one_scan = header_of(data)
-    if not width:
-        raise InputError(f"{source}: the JPEG header is damaged or cut", "copy the file again")
-    check_size(source, width, height, at_once * held, at_once * len(data))
+    header = _checked_header(data, source, at_once)
     # What follows the picture, as in motion photos, may hold more.
-    may_have_many = not is_one_scan and data.count(bytes((0xFF, _SCAN))) > _MAX_SCANS
+    may_have_many = not header.is_one_scan and data.count(bytes((0xFF, _SCAN))) > _MAX_SCANS
     if may_have_many and sum(part[0] == _SCAN for part in segments(data, beyond_scan=True)) > _MAX_SCANS:
         raise InputError(f"{source}: the JPEG has more than {_MAX_SCANS} scans", "the file is damaged or a bomb")
     try:
         return _gray(data)
     except _FAULTS:
         return _decode_odd(*_picture_of(data), source)
+
+
+def decode_uncommon(data: bytes, source: object) -> tuple[NDArray[Any], float]:
+    """Samples, (height, width) or RGB, of a picture that is `Header.is_uncommon`, and their level of white.
+
+    Raises:
+        InputError: truncated, damaged.
+    """
+    import imagecodecs
+
+    header = _checked_header(data, source)
+    with damage_explained(f"{source}: cannot be decoded as JPEG", "copy the file again"):
+        if header.marker == _JPEG_LS:
+            pixels = imagecodecs.jpegls_decode(data)
+        else:
+            pixels = imagecodecs.jpeg8_decode(data)
+            if not _picture_of(data)[1]:
+                raise InputError(f"{source}: the JPEG is cut: its last part is missing", "copy the file again")
+    return pixels, float((1 << header.precision) - 1)
+
+
+def with_height(data: bytes) -> bytes:
+    """The picture with its height in its header, where it is stated behind the first scan."""
+    frame = next((start for marker, start, _ in segments(data) if marker in _FRAMES), 0)
+    found = _HEIGHT.search(data, frame) if frame and data[frame + 1 : frame + 3] == b"\0\0" else None
+    if found is None:
+        return data
+    return data[: frame + 1] + found[1] + data[frame + 3 : found.start()] + data[found.end() :]
+
+
+def _checked_header(data: bytes, source: object, at_once: int = 1) -> Header:
+    header = header_of(data)
+    if not header.width:
+        raise InputError(f"{source}: the JPEG header is damaged or cut", "copy the file again")
+    check_size(source, header.width, header.height, at_once * header.held, at_once * len(data))
+    return header
 
 
 def colours_of(data: bytes) -> Colours:
@@ -85,26 +142,29 @@ def colours_of(data: bytes) -> Colours:
     return Colours(
         lambda: as_shares(decoded(data, _EIGHTH)),
         lambda: luma_of(decoded(data, _WHOLE), without_red(BT601)),
-        first_rows if header_of(data)[3] else None,
+        first_rows if header_of(data).is_one_scan else None,
     )
 
 
-def header_of(data: bytes) -> tuple[int, int, float, bool]:
-    """Width and height, bytes a pixel that decoding takes, and whether all of it is one scan; zeros without a scan.
+def header_of(data: bytes) -> Header:
+    """The header of a JPEG picture.
 
-    Luma, and the coefficients of all components where they come in several scans. ITU-T T.81, B.2.2: a frame's header
-    holds precision, height, width and number of components; B.2.3: a scan's begins with the number of its components.
+    Luma is held, and the coefficients of all components where they come in several scans, or their deep samples. ITU-T
+    T.81, B.2.2: a frame's header holds precision, height, width and number of components; B.2.3: a scan's begins with
+    the number of its components.
     """
-    width, height, held, n_components, is_progressive = 0, 0, 1.0, 0, False
+    header, n_components = Header(0, 0), 0
     for marker, start, end in segments(data):
         content = data[start:end]
         if marker == _SCAN:
-            return width, height, held, not is_progressive and content[:1] == bytes([n_components])
+            is_one_scan = header.marker not in _PROGRESSIVE and content[:1] == bytes([n_components])
+            return header._replace(is_one_scan=is_one_scan)
         if marker in _FRAMES and len(content) >= 6:
-            height, width, n_components = struct.unpack_from(">xHHB", content)
-            is_progressive = marker in _PROGRESSIVE
-            held = 1.0 + (2 * n_components if is_progressive else 0)
-    return 0, 0, held, False
+            precision, height, width, n_components = struct.unpack_from(">BHHB", content)
+            header = Header(width, height, precision, marker)
+            if marker in _PROGRESSIVE or header.is_uncommon:
+                header = header._replace(held=3.0 + 2 * n_components)
+    return Header(0, 0)
 
 
 def is_row(data: bytes) -> bool:

@@ -1,17 +1,18 @@
 """Metadata of picture files: exposure, ISO, make, model, lens, focal length, orientation.
 
-EXIF is parsed from bytes found without opening the picture (RAF included, whose EXIF is that of the JPEG inside).
-Missing, broken or absurd values are None and never fail a frame.
+EXIF and XMP are parsed from bytes found without opening the picture (RAF included, whose EXIF is that of the JPEG
+inside). Missing, broken or absurd values are None and never fail a frame.
 """
 
 import io
 import math
+import re
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 
 from rxcli.ingest.extent import Directories
 from rxcli.ingest.jpeg import segments
@@ -22,11 +23,24 @@ from rxcli.types import Metadata
 _PHOTOMETRIC, _DNG_VERSION = 0x0106, 0xC612
 _RAW_PHOTOMETRICS = (32803, 34892)
 # EXIF 2.32, tables 3 to 8.
-_MAKE, _MODEL, _ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
+_MAKE, _MODEL, ORIENTATION, _EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
 _EXPOSURE, _SENSITIVITY, _RECOMMENDED_INDEX, _ISO_SPEED = 0x829A, 0x8827, 0x8832, 0x8833
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM, _LENS_MODEL = 0x920A, 0xA405, 0xA434
-#: Marker of the segments of a JPEG file that hold EXIF.
-_APP1 = 0xE1
+#: Marker of the segments of a JPEG file that hold EXIF or XMP, and the tag of XMP in TIFF files.
+_APP1, _XMP = 0xE1, 700
+#: Start of EXIF behind its name, if any, and bytes in which it comes.
+_TIFF_START, _START_BYTES = re.compile(rb"II\*\0|MM\0\*"), 16
+#: Names of properties in XMP, in its namespaces `tiff` and `exif`, and in texts that programs put into PNG files.
+_PROPERTIES = {
+    b"Make": _MAKE,
+    b"Model": _MODEL,
+    b"Orientation": ORIENTATION,
+    b"ExposureTime": _EXPOSURE,
+    b"ISOSpeedRatings": _SENSITIVITY,
+    b"PhotographicSensitivity": _SENSITIVITY,
+    b"FocalLength": _FOCAL_LENGTH,
+}
+_PROPERTY = re.compile(rb"(?:^|:)(%s)(?:\0|\s*=\s*[\"']|\s*>(?:\s*<[^<>]*>)*)([^\"'<>]*)" % b"|".join(_PROPERTIES))
 #: Value of the 16-bit sensitivity tag if the ISO does not fit; longer tags then hold it.
 _ISO_OVERFLOW = 65535
 #: Enough of a file for its directories, where they must be copied.
@@ -45,23 +59,28 @@ _BOUNDS = {
     "focal_length_35mm": ("focal length", 0.01, 1e5, "mm"),
 }
 
-Tags = Mapping[int, Any]
+_Value = TypeVar("_Value")
 
 
 def jpeg_metadata(data: bytes) -> Metadata:
     """Metadata of a JPEG file's bytes."""
-    contents = (data[start:end] for marker, start, end in segments(data) if marker == _APP1)
-    return exif_metadata(next((content for content in contents if content.startswith(b"Exif\0\0")), b""))
+    return exif_metadata(*(data[start:end] for marker, start, end in segments(data) if marker == _APP1))
 
 
-def exif_metadata(exif: bytes) -> Metadata:
-    """Metadata of an EXIF block: a TIFF header and its directories, with or without `Exif\\0\\0` before it."""
-    return tiff_metadata(io.BytesIO(exif.removeprefix(b"Exif\0\0")[:_EXIF_BYTES]))
+def exif_metadata(*blocks: bytes) -> Metadata:
+    """Metadata of EXIF, a TIFF header and its directories, with or without `Exif\\0\\0` before it, and of XMP.
+
+    What several blocks state is that of the first one, and of EXIF before XMP.
+    """
+    starts = ((block, _TIFF_START.search(block[:_START_BYTES])) for block in blocks)
+    exif = [io.BytesIO(block[start.start() :][:_EXIF_BYTES]) for block, start in starts if start]
+    return _from_tags([tag for stream in exif for tag in Directories(stream).tags()], blocks)
 
 
 def tiff_metadata(stream: BinaryIO) -> Metadata:
     """Metadata of a TIFF or TIFF-like RAW file; only its directories are read."""
-    return _from_tags(*Directories(stream).tags())
+    tags = Directories(stream).tags()
+    return _from_tags(tags, [value for tag, value in tags if tag == _XMP and isinstance(value, bytes)])
 
 
 def is_raw_tiff(path: Path) -> bool:
@@ -69,7 +88,7 @@ def is_raw_tiff(path: Path) -> bool:
     has_raw_name = path.suffix.lower() in RAW_SUFFIXES
     with path.open("rb") as file:
         directories = Directories(file)
-        tags, _ = directories.tags()
+        tags = dict(directories.tags())
         has_raw_samples = not directories.values(_PHOTOMETRIC).isdisjoint(_RAW_PHOTOMETRICS)
     if not tags:
         return has_raw_name
@@ -109,6 +128,20 @@ def believed(metadata: Metadata) -> Metadata:
     return replace(metadata, not_believed=(*metadata.not_believed, *doubts.values()), **unknown)
 
 
+def orientation_of_tag(value: Any) -> int | None:
+    """One of the eight orientations, also as a byte or as a digit; None for anything else."""
+    code = value.strip(b"\0") if isinstance(value, bytes) else b""
+    number = code[0] if len(code) == 1 and code[0] < ord("0") else positive(value) or 0
+    return int(number) if number in range(1, 9) else None
+
+
+def turned(metadata: Metadata, orientation: int) -> Metadata:
+    """Metadata of a file whose format has turns of its own, by which viewers go, and not by EXIF."""
+    doubt = f"EXIF orientation {metadata.orientation} (the file has rotations of its own; columns may be reversed)"
+    doubts = () if metadata.orientation in (1, orientation) else (doubt,)
+    return replace(metadata, orientation=orientation, not_believed=(*metadata.not_believed, *doubts))
+
+
 def merge(metadata: Metadata, fallback: Metadata) -> Metadata:
     """Fill the unknown fields of `metadata` from `fallback`."""
     unknown = {f.name: getattr(fallback, f.name) for f in fields(metadata) if getattr(metadata, f.name) is None}
@@ -128,22 +161,27 @@ def _raw_metadata(file: BinaryIO) -> Metadata:
     return tiff_metadata(file)
 
 
-def _from_tags(main: Tags, exif: Tags) -> Metadata:
-    def number(*tags: int) -> float | None:
-        values = (positive(directory.get(tag)) for tag in tags for directory in (exif, main))
-        return next((value for value in values if value is not None), None)
+def _from_tags(tags: Sequence[tuple[int, Any]], xmp: Iterable[bytes]) -> Metadata:
+    """Metadata of tags and their values, and of texts that may be XMP; of each the first value that means something."""
+    for text in xmp:  # in UTF-16 there are zeros between the letters
+        found = _PROPERTY.findall(text) or _PROPERTY.findall(text.replace(b"\0", b""))
+        tags = [*tags, *((_PROPERTIES[name], value) for name, value in found)]
 
-    iso = number(_SENSITIVITY)
+    def first(meaning: Callable[[Any], _Value | None], *wanted: int) -> _Value | None:
+        meanings = (meaning(value) for one in wanted for tag, value in tags if tag == one)
+        return next((found for found in meanings if found is not None), None)
+
+    iso = first(positive, _SENSITIVITY)
     return believed(
         Metadata(
-            make=text_of(main.get(_MAKE)),
-            model=text_of(main.get(_MODEL)),
-            lens=text_of(exif.get(_LENS_MODEL)),
-            exposure_s=number(_EXPOSURE),
-            iso=number(_ISO_SPEED, _RECOMMENDED_INDEX, _SENSITIVITY) if iso == _ISO_OVERFLOW else iso,
-            focal_length_mm=number(_FOCAL_LENGTH),
-            focal_length_35mm=number(_FOCAL_LENGTH_35MM),
-            orientation=_orientation(main.get(_ORIENTATION)),
+            make=first(text_of, _MAKE),
+            model=first(text_of, _MODEL),
+            lens=first(text_of, _LENS_MODEL),
+            exposure_s=first(positive, _EXPOSURE),
+            iso=first(positive, _ISO_SPEED, _RECOMMENDED_INDEX, _SENSITIVITY) if iso == _ISO_OVERFLOW else iso,
+            focal_length_mm=first(positive, _FOCAL_LENGTH),
+            focal_length_35mm=first(positive, _FOCAL_LENGTH_35MM),
+            orientation=first(orientation_of_tag, ORIENTATION) or 1,
         )
     )
 
@@ -157,13 +195,11 @@ def text_of(value: Any) -> str | None:
 
 
 def positive(value: Any) -> float | None:
-    """A number above zero in a file; None for anything else."""
+    """A number above zero in a file, or a text of one or of a fraction; None for anything else."""
     try:
-        number = float(next(iter(value), "") if isinstance(value, tuple) else value)
+        value = next(iter(value), "") if isinstance(value, tuple) else value
+        above, _, below = (text_of(value) or "").partition("/") if isinstance(value, bytes) else (value, "", "")
+        number = float(above) / float(below or 1)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     return number if math.isfinite(number) and number > 0 else None
-
-
-def _orientation(value: Any) -> int:
-    return value if isinstance(value, int) and 1 <= value <= 8 else 1

@@ -1,6 +1,7 @@
 """Identify the kind of a file from its first bytes, or from its suffix if they are ambiguous."""
 
 import os
+import re
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,14 +10,14 @@ from typing import Literal
 
 from rxcli.errors import InputError, reason_of
 
-Kind = Literal["jpeg", "png", "tiff", "heif", "other_image", "raw", "video", "device"]
+Kind = Literal["jpeg", "png", "tiff", "heif", "jxl", "other_image", "raw", "video", "device"]
 
 
 def _suffixes(names: str) -> frozenset[str]:
     return frozenset(f".{name}" for name in names.split())
 
 
-IMAGE_SUFFIXES = _suffixes("jpg jpeg jpe jfif mpo png tif tiff heic heif hif bmp webp")
+IMAGE_SUFFIXES = _suffixes("jpg jpeg jpe jfif mpo png tif tiff heic heif hif avif jxl bmp webp")
 RAW_SUFFIXES = _suffixes(
     "raf dng arw sr2 srf nef nrw cr2 cr3 crw orf rw2 raw pef srw x3f 3fr fff iiq erf mef mos mrw kdc dcr rwl gpr"
 )
@@ -37,10 +38,11 @@ MAX_BYTES = 1_250_000_000
 
 #: Starts of playlists (HLS, FFmpeg's concat, DASH), whatever their names.
 _LIST_MAGIC = (b"#EXTM3U", b"ffconcat", b"<MPD")
-_HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"hevc", b"hevx", b"msf1")
+_HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"mif2", b"miaf", b"hevc", b"hevx", b"msf1")
 #: Signatures: offset, bytes and kind; the first match decides.
 _MAGIC: tuple[tuple[int, tuple[bytes, ...], Kind], ...] = (
     (0, (b"\xff\xd8",), "jpeg"),
+    (0, (b"\xff\n", b"\0\0\0\x0cJXL \r\n\x87\n"), "jxl"),
     (0, (b"\x89PNG\r\n\x1a\n",), "png"),
     (0, (b"FUJIFILMCCD-RAW", b"IIRO", b"IIRS", b"MMOR", b"IIU\0", b"FOVb", b"\0MRM"), "raw"),
     (0, (b"II\x1a\0\0\0HEAPCCDR",), "raw"),
@@ -49,6 +51,7 @@ _MAGIC: tuple[tuple[int, tuple[bytes, ...], Kind], ...] = (
     (0, (b"BM",), "other_image"),
     (8, (b"WEBP",), "other_image"),
     (4, (b"ftypcrx ",), "raw"),
+    (4, (b"ftypavif",), "other_image"),
     (4, tuple(b"ftyp" + brand for brand in _HEIF_BRANDS), "heif"),
     (4, (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"moof", b"pnot"), "video"),
     (0, (b"\x1a\x45\xdf\xa3",), "video"),  # Matroska
@@ -56,6 +59,8 @@ _MAGIC: tuple[tuple[int, tuple[bytes, ...], Kind], ...] = (
     (0, (b"FLV\1",), "video"),
     (0, (b"\0\0\0\1", b"\0\0\1\xb3", b"\0\0\1\xba"), "video"),  # H.264, HEVC, MPEG without a container
 )
+#: Starts of pictures that are long enough to be no chance behind other bytes.
+_PICTURE = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
 
 
 def check_file(path: Path) -> Kind | None:
@@ -107,7 +112,17 @@ def sniff(head: bytes, suffix: str) -> Kind | None:
     if suffix in MJPEG_SUFFIXES or (head.lstrip().startswith(b"--") and b"image/jpeg" in head.lower()):
         return "video"
     by_name: Kind | None = "raw" if suffix in RAW_SUFFIXES else "video" if suffix in VIDEO_SUFFIXES else None
-    return next((kind for at, starts, kind in _MAGIC if head.startswith(starts, at)), by_name)
+    kind = next((kind for at, starts, kind in _MAGIC if head.startswith(starts, at)), by_name)
+    if kind is None and (stray := start_of_picture(head)):
+        return sniff(head[stray:], suffix)
+    # The brand of any picture; those that it goes with name the codec.
+    return "other_image" if kind == "heif" and b"avif" in head[: int.from_bytes(head[:4])] else kind
+
+
+def start_of_picture(head: bytes) -> int:
+    """Bytes before a JPEG or PNG that do not belong to it, such as the mark that text programs put before a file."""
+    found = _PICTURE.search(head[:HEAD_BYTES])
+    return found.start() if found else 0
 
 
 def check_no_list(path: Path, head: bytes) -> None:

@@ -2,25 +2,31 @@
 
 import io
 import lzma
+import re
 import struct
 import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
 
+import imagecodecs
 import numpy as np
 import odd_stills
 import pytest
+import tifffile
 from ingest_files import BAYER, one_frame, read_all, write_dng
 from PIL import Image
 
 from rxcli.ingest import KNOWN_SUFFIXES
 from rxcli.ingest.heif import _bytes_a_pixel
+from rxcli.ingest.metadata import exif_metadata
+from rxcli.types import Metadata
 
 Y, X = np.mgrid[:48, :80]
 GREY = (3 * Y + X + 20 * (Y < 10) * (X > 60)).astype(np.uint8)
 PICTURE = np.repeat(GREY[:, :, None], 3, axis=2)
 JPEGS = odd_stills.odd_jpegs(PICTURE)
 PNGS, TIFFS = odd_stills.odd_pngs(PICTURE), odd_stills.odd_tiffs(PICTURE)
+ORIENTATIONS, UNCOMMON = odd_stills.orientations(PICTURE), odd_stills.uncommon_jpegs(GREY)
 NOISE = np.repeat(np.random.default_rng(4).integers(0, 255, (96, 160, 1), dtype=np.uint8), 3, axis=2)
 
 
@@ -73,6 +79,106 @@ def test_orientation_is_that_of_the_exif(tmp_path: Path, name: str, options: dic
     frame = one_frame(tmp_path / name)
     assert frame.metadata.orientation == 3
     np.testing.assert_allclose(frame.pixels, GREY, atol=20)
+
+
+@pytest.mark.parametrize("name", ORIENTATIONS)
+def test_orientation_wherever_and_however_it_is_stated(tmp_path: Path, name: str) -> None:
+    frame = one_frame(written(tmp_path / name, ORIENTATIONS[name]))
+    assert frame.metadata.orientation == 3
+    np.testing.assert_allclose(frame.pixels, GREY, atol=20)
+
+
+def test_exif_goes_before_xmp_and_the_first_before_later_ones() -> None:
+    upright, turned = (odd_stills.tiff_header((0x0112, 3, 1, bytes((number, 0, 0, 0)))) for number in (1, 6))
+    assert exif_metadata(upright, odd_stills.XMP["attribute"].encode()).orientation == 1
+    assert exif_metadata(turned, upright).orientation == 6
+    told = odd_stills.xmp('tiff:Model="Phone" exif:ExposureTime="1/24000" exif:FocalLength="52/10">').encode()
+    assert exif_metadata(upright, told) == Metadata(model="Phone", exposure_s=1 / 24000, focal_length_mm=5.2)
+
+
+@pytest.mark.parametrize("name", UNCOMMON)
+def test_jpeg_of_many_bits_or_without_loss_or_with_its_height_last(tmp_path: Path, name: str) -> None:
+    frame = one_frame(written(tmp_path / "a.jpg", UNCOMMON[name]))
+    np.testing.assert_allclose(255.0 * (frame.pixels / frame.white), GREY, atol=8)
+
+
+@pytest.mark.parametrize("name", UNCOMMON)
+def test_an_uncommon_jpeg_that_is_cut_is_refused(tmp_path: Path, name: str) -> None:
+    frames, error = read_all(written(tmp_path / "a.jpg", UNCOMMON[name][: 2 * len(UNCOMMON[name]) // 3]))
+    assert not frames
+    assert re.search("is cut: |decoded as JPEG|header is damaged|80 x 0 pixels", str(error))
+
+
+@pytest.mark.parametrize("stray", [b"\xef\xbb\xbf", b"\r\n", bytes(16)], ids=["mark", "line", "zeros"])
+def test_stray_bytes_before_a_picture(tmp_path: Path, stray: bytes) -> None:
+    jpeg, png = JPEGS["icc"][1], PNGS["eXIf"]
+    for name, data in (("a.jpg", jpeg), ("a.png", png)):
+        plain, odd = (one_frame(written(tmp_path / name, before + data)) for before in (b"", stray))
+        np.testing.assert_array_equal(odd.pixels, plain.pixels)
+        assert odd.metadata == plain.metadata
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_turns_of_avif_and_jpeg_xl(tmp_path: Path, orientation: int) -> None:
+    exif, avif, jpeg = odd_stills.exif_bytes(orientation), io.BytesIO(), io.BytesIO()
+    Image.fromarray(GREY).save(avif, "AVIF", exif=exif, quality=95)
+    Image.fromarray(GREY).save(jpeg, "JPEG", exif=exif, quality=95)
+    files = {"a.avif": avif.getvalue(), "b.avif": avif.getvalue().replace(b"ftypavif", b"ftypmif1")}
+    for name, data in (files | {"a.jxl": imagecodecs.jpegxl_encode_jpeg(jpeg.getvalue(), usecontainer=True)}).items():
+        frame = one_frame(written(tmp_path / name, data))
+        assert (frame.metadata.orientation, frame.metadata.make) == (orientation, "Example")
+        np.testing.assert_allclose(frame.pixels, GREY, atol=6)
+
+
+def test_avif_of_several_tiles(tmp_path: Path) -> None:
+    luma = np.tile(GREY, (4, 4))
+    frame = one_frame(written(tmp_path / "a.avif", odd_stills.tiled_avif(luma)))
+    assert np.abs(frame.pixels.astype(int) - luma).mean() < 3
+
+
+@pytest.mark.parametrize(
+    ("pixels", "options"),
+    [
+        (GREY, {}),
+        (PICTURE, {"usecontainer": True}),
+        (GREY.astype(np.uint16) * 4, {"bitspersample": 10}),
+        (GREY.astype(np.uint16) * 257, {}),
+        (GREY / np.float32(255), {}),
+        (np.tile(GREY, (30, 1)), {}),
+    ],
+    ids=["grey", "boxes", "10 bits", "16 bits", "floats", "high"],
+)
+def test_jpeg_xl(tmp_path: Path, pixels: np.ndarray, options: dict[str, int]) -> None:
+    data = imagecodecs.jpegxl_encode(pixels, lossless=True, **options)
+    frame = one_frame(written(tmp_path / "a.jxl", data))
+    expected = np.tile(GREY, (frame.pixels.shape[0] // len(GREY), 1))
+    np.testing.assert_allclose(255.0 * (frame.pixels / frame.white), expected, atol=1)
+    _, error = read_all(written(tmp_path / "a.jxl", data[: len(data) // 2]))
+    assert "is damaged or cut" in str(error)
+
+
+def test_jpeg_xl_larger_than_memory_is_refused_before_it_is_unfolded(tmp_path: Path) -> None:
+    def bits(*fields: tuple[int, int]) -> bytes:
+        number, at = 0, 0
+        for value, width in fields:
+            number, at = number | value << at, at + width
+        return number.to_bytes(32, "little")
+
+    header = bits((0, 1), (3, 2), (59_999, 30), (0, 3), (3, 2), (39_999, 30), (0, 1), (1, 1), (5, 3))
+    frames, error = read_all(written(tmp_path / "a.jxl", b"\xff\n" + header))
+    assert not frames
+    assert "claims 40000 x 60000 pixels" in str(error)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.uint32])
+def test_few_samples_far_above_all_others_leave_these_their_levels(tmp_path: Path, dtype: type) -> None:
+    light = np.tile(GREY, (4, 4)).astype(dtype) * 1000
+    for name, hot in (("plain.tif", 0), ("hot.tif", 5)):
+        light[7, :hot] = 4e9
+        tifffile.imwrite(tmp_path / name, light)
+    plain, hot = (one_frame(tmp_path / name) for name in ("plain.tif", "hot.tif"))
+    ratio = hot.pixels[20:].astype(float).mean() / plain.pixels[20:].mean()
+    assert 0.2 < ratio <= 1
 
 
 def test_a_heic_that_is_not_turned_itself_keeps_its_order_and_says_so(tmp_path: Path) -> None:

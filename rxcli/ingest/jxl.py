@@ -1,0 +1,92 @@
+"""JPEG XL pictures: samples as stored; their turn is in the code itself (ISO/IEC 18181-1, annex D)."""
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rxcli.ingest.luma import BT601, Weights
+from rxcli.ingest.metadata import exif_metadata, turned
+from rxcli.ingest.sniff import check_size, damage_explained
+from rxcli.types import Metadata
+
+_CODE = b"\xff\n"
+#: D.2, D.3: bits of a length by their kind, and widths as shares of the height; usual bits a sample.
+_LENGTH_BITS, _RATIOS = (9, 13, 18, 30), ((1, 1), (12, 10), (4, 3), (3, 2), (16, 9), (5, 4), (2, 1))
+_DEPTHS, _HEADER_BYTES = (8, 10, 12), 64
+#: More than EXIF and XMP unfold to.
+_NOTE_BYTES = 1 << 20
+#: What the decoder holds: floats of three colours and of alpha, the samples, and luma.
+_BYTES_A_PIXEL = 30
+
+
+def read_jxl(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]:
+    """Samples as stored, metadata with the orientation that the code asks for, and the weights of luma.
+
+    Raises:
+        InputError: damaged, too large.
+    """
+    import imagecodecs
+
+    # Of code in parts, each has its number first.
+    parts = ((kind, _content(data, kind)) for kind in (b"jxlc", b"jxlp"))
+    code = next((content[4 * (kind == b"jxlp") :] for kind, content in parts if content), data)
+    width, height, orientation, bits = _header(code)
+    check_size(path, width, height, _BYTES_A_PIXEL, len(data))
+    with damage_explained(f"{path}: the JPEG XL picture is damaged or cut", "copy the file again"):
+        pixels = imagecodecs.jpegxl_decode(data, index=0, keeporientation=True)
+    if pixels.dtype.kind == "f":
+        pixels = np.rint(np.clip(pixels, 0, 1) * 65535).astype(np.uint16)
+    elif pixels.dtype == np.uint16:
+        pixels <<= max(16 - bits, 0)
+    return pixels, turned(exif_metadata(_note(data, b"Exif"), _note(data, b"xml ")), orientation), BT601
+
+
+def _content(data: bytes, kind: bytes) -> bytes:
+    """What is in a box of the file (ISO/IEC 18181-2), the rest where its size is not given; empty without the box."""
+    at = data.find(kind)
+    size = int.from_bytes(data[max(at - 4, 0) : max(at, 0)])
+    return data[at + len(kind) : at - 4 + size if size > len(kind) else None] if at >= 0 else b""
+
+
+def _note(data: bytes, kind: bytes) -> bytes:
+    """EXIF or XMP, which may be packed."""
+    import imagecodecs
+
+    with suppress(imagecodecs.BrotliError):
+        packed = _content(data, b"brob" + kind)
+        return bytes(imagecodecs.brotli_decode(packed, out=_NOTE_BYTES)) if packed else _content(data, kind)
+    return b""
+
+
+def _header(code: bytes) -> tuple[int, int, int, int]:
+    """Width, height, EXIF orientation, and bits a sample."""
+    bits = int.from_bytes(code.removeprefix(_CODE)[:_HEADER_BYTES], "little")
+
+    def take(n: int) -> int:
+        nonlocal bits
+        value, bits = bits & (1 << n) - 1, bits >> n
+        return value
+
+    def size() -> tuple[int, int]:
+        def length() -> int:
+            return 8 * (take(5) + 1) if is_small else take(_LENGTH_BITS[take(2)]) + 1
+
+        is_small = take(1)
+        height, ratio = length(), take(3)
+        above, below = _RATIOS[ratio - 1]
+        return (height * above // below if ratio else length()), height
+
+    width, height = size()
+    if take(1):  # all the rest is as usual
+        return width, height, 1, 8
+    has_more = take(1)
+    orientation = take(3) + 1 if has_more else 1
+    if has_more and take(1):
+        size()  # for showing
+    if (has_more and take(2)) or take(1):  # a preview, an animation, floats
+        return width, height, orientation, 16
+    depth = take(2)
+    return width, height, orientation, _DEPTHS[depth] if depth < len(_DEPTHS) else take(6) + 1
