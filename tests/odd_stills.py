@@ -63,7 +63,7 @@ def odd_jpegs(picture: NDArray[np.uint8]) -> dict[str, tuple[bytes, bytes]]:
     }
     late = {
         "tail": progressive + b"\xff\xda" * 101,
-        "many_pictures": progressive * 15,
+        "many_pictures": (progressive + b"x") * 15,
         "comment": progressive[:2] + segment(0xFE, b"\xff\xda" * 101) + progressive[2:],
         "no_end_progressive": progressive[:-2],
         "no_end_trailer_progressive": progressive[:-2] + trailer,

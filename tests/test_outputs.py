@@ -208,6 +208,22 @@ def test_a_pipe_with_the_name_of_a_tap_is_refused(tmp_path: Path) -> None:
         dump_stages(tmp_path, "a.jpg", 0, {})
 
 
+def test_names_as_long_as_file_systems_take_are_cut_where_something_is_appended(
+    tmp_path: Path, names: list[str]
+) -> None:
+    lens = "[lens]\nwidth = 340\nheight = 620\ndist_coeffs = [-0.1, 0.0, 0.0, 0.0]\n"
+    matrix = "camera_matrix = [[500.0, 0.0, 169.5], [0.0, 500.0, 309.5], [0.0, 0.0, 1.0]]\n"
+    camera = tmp_path / "profiles" / "camera.toml"
+    camera.write_text(f"{camera.read_text()}\n{lens}{matrix}")
+    for name in (240 * "a" + "1.png", 240 * "a" + "2.png", 79 * "字" + ".png"):
+        (tmp_path / "in" / name).write_bytes((tmp_path / "in" / "a.png").read_bytes())
+    taps, pictures = tmp_path / "taps", tmp_path / "pictures"
+    command = ["decode", str(tmp_path / "in"), *names, "--truth", "auto", "--dump-dir", str(taps)]
+    assert run([*command, "--save-undistorted", str(pictures)]) in (0, 1)
+    assert len([*taps.rglob("*.npz")]) == len([*pictures.rglob("*.png")]) == 4
+    assert run(["inspect", str(tmp_path / "in" / (240 * "a" + "1.png")), *names, "--out", str(tmp_path / "page")]) == 0
+
+
 def test_taps_of_files_with_one_name_stand_in_their_folders(
     tmp_path: Path, names: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

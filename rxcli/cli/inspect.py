@@ -15,6 +15,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.outputs import Output, claim, claim_own_folder, write_whole
 from rxcli.receiver.receive import receive
 from rxcli.results.cameras import camera_of, screen_of
+from rxcli.results.dump import plain_name
 from rxcli.results.page import MARK, inspection_page
 from rxcli.results.report import format_link
 from rxcli.results.truth import Scorer, load_truth, truth_for
@@ -92,7 +93,7 @@ def write_page(
 
 def _stem(path: str) -> str:
     """A folder's name from a file's: what any system takes."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", Path(path).name).strip("._") or "picture"
+    return plain_name(path).strip("._") or "picture"
 
 
 def _received(

@@ -41,7 +41,11 @@ def read_jxl(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]:
         pixels = np.rint(np.clip(pixels, 0, 1) * 65535).astype(np.uint16)
     elif pixels.dtype == np.uint16:
         pixels <<= max(16 - bits, 0)
-    return pixels, turned(exif_metadata(_note(data, b"Exif"), _note(data, b"xml ")), orientation), BT601
+    return (
+        pixels,
+        turned(exif_metadata(_metadata_block(data, b"Exif"), _metadata_block(data, b"xml ")), orientation),
+        BT601,
+    )
 
 
 def _content(data: bytes, kind: bytes) -> bytes:
@@ -51,7 +55,7 @@ def _content(data: bytes, kind: bytes) -> bytes:
     return data[at + len(kind) : at - 4 + size if size > len(kind) else None] if at >= 0 else b""
 
 
-def _note(data: bytes, kind: bytes) -> bytes:
+def _metadata_block(data: bytes, kind: bytes) -> bytes:
     """EXIF or XMP, which may be packed."""
     import imagecodecs
 
@@ -65,28 +69,28 @@ def _header(code: bytes) -> tuple[int, int, int, int]:
     """Width, height, EXIF orientation, and bits a sample."""
     bits = int.from_bytes(code.removeprefix(_CODE)[:_HEADER_BYTES], "little")
 
-    def take(n: int) -> int:
+    def bit_field(n: int) -> int:
         nonlocal bits
         value, bits = bits & (1 << n) - 1, bits >> n
         return value
 
     def size() -> tuple[int, int]:
         def length() -> int:
-            return 8 * (take(5) + 1) if is_small else take(_LENGTH_BITS[take(2)]) + 1
+            return 8 * (bit_field(5) + 1) if is_small else bit_field(_LENGTH_BITS[bit_field(2)]) + 1
 
-        is_small = take(1)
-        height, ratio = length(), take(3)
+        is_small = bit_field(1)
+        height, ratio = length(), bit_field(3)
         above, below = _RATIOS[ratio - 1]
         return (height * above // below if ratio else length()), height
 
     width, height = size()
-    if take(1):  # all the rest is as usual
+    if bit_field(1):  # all the rest is as usual
         return width, height, 1, 8
-    has_more = take(1)
-    orientation = take(3) + 1 if has_more else 1
-    if has_more and take(1):
+    has_more = bit_field(1)
+    orientation = bit_field(3) + 1 if has_more else 1
+    if has_more and bit_field(1):
         size()  # for showing
-    if (has_more and take(2)) or take(1):  # a preview, an animation, floats
+    if (has_more and bit_field(2)) or bit_field(1):  # a preview, an animation, floats
         return width, height, orientation, 16
-    depth = take(2)
-    return width, height, orientation, _DEPTHS[depth] if depth < len(_DEPTHS) else take(6) + 1
+    depth = bit_field(2)
+    return width, height, orientation, _DEPTHS[depth] if depth < len(_DEPTHS) else bit_field(6) + 1

@@ -167,21 +167,21 @@ def _from_tags(tags: Sequence[tuple[int, Any]], xmp: Iterable[bytes]) -> Metadat
         found = _PROPERTY.findall(text) or _PROPERTY.findall(text.replace(b"\0", b""))
         tags = [*tags, *((_PROPERTIES[name], value) for name, value in found)]
 
-    def first(meaning: Callable[[Any], _Value | None], *wanted: int) -> _Value | None:
-        meanings = (meaning(value) for one in wanted for tag, value in tags if tag == one)
+    def stated(meaning: Callable[[Any], _Value | None], *wanted: int) -> _Value | None:
+        meanings = (meaning(value) for number in wanted for tag, value in tags if tag == number)
         return next((found for found in meanings if found is not None), None)
 
-    iso = first(positive, _SENSITIVITY)
+    iso = stated(positive, _SENSITIVITY)
     return believed(
         Metadata(
-            make=first(text_of, _MAKE),
-            model=first(text_of, _MODEL),
-            lens=first(text_of, _LENS_MODEL),
-            exposure_s=first(positive, _EXPOSURE),
-            iso=first(positive, _ISO_SPEED, _RECOMMENDED_INDEX, _SENSITIVITY) if iso == _ISO_OVERFLOW else iso,
-            focal_length_mm=first(positive, _FOCAL_LENGTH),
-            focal_length_35mm=first(positive, _FOCAL_LENGTH_35MM),
-            orientation=first(orientation_of_tag, ORIENTATION) or 1,
+            make=stated(text_of, _MAKE),
+            model=stated(text_of, _MODEL),
+            lens=stated(text_of, _LENS_MODEL),
+            exposure_s=stated(positive, _EXPOSURE),
+            iso=stated(positive, _ISO_SPEED, _RECOMMENDED_INDEX, _SENSITIVITY) if iso == _ISO_OVERFLOW else iso,
+            focal_length_mm=stated(positive, _FOCAL_LENGTH),
+            focal_length_35mm=stated(positive, _FOCAL_LENGTH_35MM),
+            orientation=stated(orientation_of_tag, ORIENTATION) or 1,
         )
     )
 

@@ -4,7 +4,7 @@ import os
 import re
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
@@ -59,6 +59,8 @@ _MAGIC: tuple[tuple[int, tuple[bytes, ...], Kind], ...] = (
     (0, (b"FLV\1",), "video"),
     (0, (b"\0\0\0\1", b"\0\0\1\xb3", b"\0\0\1\xba"), "video"),  # H.264, HEVC, MPEG without a container
 )
+#: An extension as programs give it to a kind of files.
+_EXTENSION = re.compile(r"\.[a-z][a-z0-9]*\Z", re.IGNORECASE)
 #: Starts of pictures that are long enough to be no chance behind other bytes.
 _PICTURE = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n\x1a\n")
 
@@ -115,8 +117,21 @@ def sniff(head: bytes, suffix: str) -> Kind | None:
     kind = next((kind for at, starts, kind in _MAGIC if head.startswith(starts, at)), by_name)
     if kind is None and (stray := start_of_picture(head)):
         return sniff(head[stray:], suffix)
-    # The brand of any picture; those that it goes with name the codec.
+    # A brand of any picture goes with the brand of its codec.
     return "other_image" if kind == "heif" and b"avif" in head[: int.from_bytes(head[:4])] else kind
+
+
+def is_unnamed_picture(path: str) -> bool:
+    """Whether a file is a picture or clip, though its name states no kind: `IMG_0001`, `photo.jpg.1`, `photo.jpg_1`.
+
+    A name that ends in a dot and letters states one. No text has a zero among its first bytes.
+    """
+    if _EXTENSION.search(path) or not os.path.isfile(path):
+        return False
+    with suppress(OSError), open(path, "rb") as file:
+        head = file.read(HEAD_BYTES)
+        return b"\0" in head and sniff(head, "") is not None
+    return False
 
 
 def start_of_picture(head: bytes) -> int:

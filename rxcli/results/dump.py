@@ -15,6 +15,9 @@ from rxcli.types import BurstPosteriors, Clock, FloatArray, OnTaps, RowProfiles,
 
 _Stage = TypeVar("_Stage", RowProfiles, Clock, SlotSamples, BurstPosteriors)
 
+#: Longer names, of the 255 bytes that file systems take, are cut where something is appended.
+MAX_NAME_BYTES = 200
+
 
 @dataclass(frozen=True, slots=True)
 class Taps:
@@ -97,8 +100,8 @@ def dump_stages(folder: Path, source: str, frame: int, stages: Mapping[str, Any]
 
 
 def plain_name(source: str) -> str:
-    """The name of a source's file, as any file system takes it."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", Path(source).name) or "frame"
+    """The name of a source's file, as any file system takes it, with room for an ending."""
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", Path(source).name)[:MAX_NAME_BYTES] or "frame"
 
 
 def _arrays(name: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -11,6 +11,7 @@ its bursts together, and the bursts that were found are expected; where none was
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator, Sized
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -92,7 +93,7 @@ def truth_path(capture: str | Path) -> Path:
 def truth_for(capture: str | Path, asked: str | Path | None) -> Path | None:
     """The truth of `capture` where a file is asked for, or "auto" for the one beside it; None where there is none."""
     path = truth_path(capture) if asked == "auto" else asked and Path(asked)
-    return path if path and (asked != "auto" or path.is_file()) else None
+    return path if path and (asked != "auto" or os.path.isfile(path)) else None
 
 
 def load_truth(path: str | Path) -> Truth:

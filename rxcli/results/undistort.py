@@ -1,6 +1,7 @@
 """Whole pictures without their lens distortion, for people to look at; the receiver itself never warps pixels."""
 
 import logging
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from rxcli.outputs import PICTURE, check_replaceable, encode_png, make_parent, w
 from rxcli.profiles import CameraProfile, match_camera
 from rxcli.receiver.screen.geometry import lens_for
 from rxcli.results.cameras import camera_of
+from rxcli.results.dump import MAX_NAME_BYTES, plain_name
 from rxcli.types import Float32Array, Frame, FrameResult, Lens, Mosaic
 
 log = logging.getLogger(__name__)
@@ -108,7 +110,9 @@ class UndistortedWriter:
         lens = lens_for(camera.lens, frame.width, frame.height) if camera and camera.lens else None
         if lens is None:
             return False
-        path = self.folder / subfolder / f"{Path(frame.source).name}.{frame.index:05d}.png"
+        name = Path(frame.source).name
+        name = name if len(os.fsencode(name)) <= MAX_NAME_BYTES else plain_name(name)
+        path = self.folder / subfolder / f"{name}.{frame.index:05d}.png"
         make_parent(path)
         check_replaceable(path, PICTURE, "--save-undistorted")
         write_whole(path, encode_png(undistorted(frame, lens)), follow=False)

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError, is_out_of_memory, reason_of
 from rxcli.ingest import open_source
 from rxcli.ingest.ahead import in_order
+from rxcli.ingest.sniff import is_unnamed_picture
 from rxcli.link.collector import Collector
 from rxcli.options import ReceiverOptions
 from rxcli.outputs import OUTPUT_MARKER
@@ -74,7 +75,8 @@ class Source:
 def collect_sources(paths: Iterable[str], suffixes: frozenset[str]) -> list[Source]:
     """The sources that `paths` name: files as they are, folders recursively and in order of name.
 
-    Each file is taken once. In folders, files of other suffixes and hidden ones are passed over; "-" is stdin.
+    Each file is taken once. In folders, hidden files and those of other suffixes are passed over; without a suffix
+    the content decides. "-" is stdin.
 
     Args:
         paths: files and folders.
@@ -105,7 +107,11 @@ def _sources_of(path: str, suffixes: frozenset[str]) -> Iterator[Source]:
         yield Source(path, path)
         return
     refused: list[OSError] = []
-    files = [name for name in _walk(path, refused.append) if os.path.splitext(name)[1].casefold() in suffixes]
+    files = [
+        name
+        for name in _walk(path, refused.append)
+        if os.path.splitext(name)[1].casefold() in suffixes or is_unnamed_picture(name)
+    ]
     if not files and not refused:
         listed = ", ".join(sorted(suffix.lstrip(".") for suffix in suffixes))
         problem = f"{path}: the folder holds no picture or clip; name files, or a folder with {listed}"

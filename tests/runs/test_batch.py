@@ -40,6 +40,29 @@ def test_folders_are_walked_in_order_and_files_taken_once(tmp_path: Path) -> Non
     assert found == ["notes.txt", "b.jpg", "a.MP4", "sub/c.jpg", "missing"]
 
 
+def test_pictures_without_an_extension_are_known_by_their_content(tmp_path: Path) -> None:
+    """As cameras, downloads and archives name them; a name with another extension means what it says."""
+    taken = (
+        "IMG_0001",
+        "a b.JPG;1",
+        "photo.jpg (2)",
+        "photo.jpg.1",
+        "pic.jpg_large",
+        "x.jpg!d",
+        "x.jpg?w=800",
+        "x.jpg~",
+    )
+    passed_over = ("a.jpg.part", "a.thm", "notes.1", "README")
+    for name in (*taken, *passed_over):
+        (tmp_path / name).write_bytes(b"\xff\xd8\xff\xe0\0\x10JFIF\0")
+    (tmp_path / "notes.1").write_text("for free use")
+    (tmp_path / "README").write_text("BM is the start of a bitmap")
+    (tmp_path / "empty").touch()
+    os.mkfifo(tmp_path / "pipe")
+    found = [os.path.basename(source.name) for source in collect_sources([str(tmp_path)], SUFFIXES)]
+    assert found == sorted(taken)
+
+
 def test_a_folder_without_pictures_is_a_reason_not_silence(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
     [source] = collect_sources([str(tmp_path)], SUFFIXES)
