@@ -410,6 +410,31 @@ class PacketResult:
         return bytes.fromhex(self.payload)
 
 
+_OfPicture = Literal["black", "saturated", "few_pixels", "too_tall", "no_columns", "no_columns_dark", "lit"]
+_OfOutline = Literal["portrait", "on_its_side", "corners_far", "corners_outside", "corners_few_rows"]
+_OfStripes = Literal["no_stripes", "part_striped", "narrow_stripes", "no_stripes_across", "long_exposure"]
+_OfLight = Literal["steady_light", "one_lamp", "screen_dark", "nothing_lit", "unsure", "no_column"]
+_OfPackets = Literal["no_headers", "no_header", "part_in_view", "screen_fills_little", "packet_too_long"]
+_OfColumn = Literal["headerless", "echo", "out_of_view", "goes_on", "withheld", "incomplete", "dark", "uncertain"]
+_OfNumbers = Literal["not_read", "column_numbers", "one_column", "column_alone", "all_the_same", "one_screen_tried"]
+_OfCamera = Literal["no_readout_mode", "other_camera", "other_exposure", "other_camera_and_exposure", "not_believed"]
+_OfRows = Literal["upside_down", "as_stored", "turned_clockwise", "turned_counterclockwise"]
+_OfClip = Literal["stabilised", "doubled", "certain_before", "nominal_times", "retimed", "slow_motion"]
+#: Why a result is as it is; `rxcli.results.reasons` has a sentence for each.
+Reason = Literal[
+    _OfPicture, _OfOutline, _OfStripes, _OfLight, _OfPackets, _OfColumn, _OfNumbers, _OfCamera, _OfRows, _OfClip
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Remark:
+    """A reason and what was measured of it."""
+
+    reason: Reason
+    #: By the names in the reason's sentence.
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
 @dataclass(frozen=True, slots=True)
 class ColumnResult:
     """Result of one column."""
@@ -422,8 +447,14 @@ class ColumnResult:
     #: Delay against the common clock.
     delay_slots: float | None = None
     packets: tuple[PacketResult, ...] = ()
-    #: Reason and next step if nothing was decoded.
+    #: Why nothing was decoded; and as a sentence, see `FrameResult.message`.
+    remark: Remark | None = None
     message: str | None = None
+
+    @property
+    def reason(self) -> Reason | None:
+        """Why nothing was decoded."""
+        return None if self.remark is None else self.remark.reason
 
 
 @dataclass(frozen=True, slots=True)
@@ -527,7 +558,7 @@ class FrameResult:
     frame: int
     time_s: float
     status: FrameStatus
-    #: Reason and next step of a failure.
+    #: `remarks` in sentences, reason and next step: written by `rxcli.results.reasons` once the receiver is done.
     message: str | None = None
     screen_profile: str | None = None
     #: (4, 2) image pixels, top-left first, clockwise as a viewer sees the screen.
@@ -568,6 +599,8 @@ class FrameResult:
     #: In the last result of a source: incomplete files, and sentences about refused ones.
     progress: tuple[ObjectProgress, ...] = ()
     link_notes: tuple[str, ...] = ()
+    #: What there is to know of the result, the reason of a failure first.
+    remarks: tuple[Remark, ...] = ()
     #: Whether the decoding process was killed; a resumed run then decodes the source again.
     retry: bool = False
 
@@ -577,20 +610,15 @@ class FrameResult:
         return tuple(packet for column in self.columns for packet in column.packets)
 
     @property
+    def reason(self) -> Reason | None:
+        """Why reception failed, or what there is to know of a result."""
+        return self.remarks[0].reason if self.remarks else None
+
+    @property
     def gives_camera(self) -> bool:
         """Whether the camera was estimated and half of the columns gave packets, so that it holds for other photos."""
         n_received = sum(any(packet.is_believable for packet in column.packets) for column in self.columns)
         return "line_delay_s" in self.estimated and 2 * n_received >= max(len(self.columns), 1)
-
-    @property
-    def numbering_remark(self) -> str:
-        """What the numbers of the columns are worth if the picture leaves them open."""
-        leftmost = next((column.column for column in self.columns if column.packets), 0)
-        return (
-            f"columns numbered from the leftmost that was seen: it is the screen's column {leftmost} with a "
-            f"probability of {self.column_certainty:.2f}; take one side of the screen into view to have the screen's "
-            "numbers"
-        )
 
     def with_columns_mirrored(self) -> FrameResult:
         """Count columns, corners and soft bits from the opposite side."""

@@ -106,7 +106,7 @@ def test_stages_know_nothing_of_each_other_and_only_the_wiring_joins_them(room: 
         ("receiver", ()),
         ("results", ("receiver", "ingest", "link")),
         ("runs", ("receiver", "ingest", "results", "link")),
-        ("calibrate", ("receiver", "ingest")),
+        ("calibrate", ("receiver", "ingest", "results")),
         ("web", ("receiver", "ingest", "results", "runs", "link")),
     ],
 )

@@ -13,6 +13,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
 from rxcli.receiver.camera import camera_profile
 from rxcli.receiver.receive import receive_frame
+from rxcli.results.reasons import sentence_of
 from rxcli.types import Frame
 
 _CORRECTED = "the camera corrected its lens distortion: line delay and distortion were estimated together"
@@ -34,7 +35,7 @@ def calibrate_slots(frames: Sequence[Frame], screen: ScreenProfile, axis: Axis =
     results = [receive_frame(frame, ReceiverOptions(screens=(screen,), cameras=())) for frame in upright]
     confirmed = [r.estimated for r in results if any(p.is_believable for p in r.packets)]
     if not confirmed:
-        reason = next((f" ({r.message.split(';')[0]})" for r in results if r.message), "")
+        reason = next((f" ({sentence_of(r.remarks[0]).split(';')[0]})" for r in results if r.remarks), "")
         hint = "let the whole screen show and use a short exposure; at least two rows a slot are needed"
         raise ReceiverError(f"no slot clock of a sending screen in the pictures{reason}", hint)
     value, sd = weighted_mean(*zip(*(estimated["line_delay_s"] for estimated in confirmed), strict=True))

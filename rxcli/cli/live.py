@@ -64,6 +64,7 @@ def live(device: Path, **options: Any) -> int:
     from rxcli.link.collector import Collector
     from rxcli.link.saving import save_objects
     from rxcli.receiver.receive import receive
+    from rxcli.results.reasons import explained
 
     source = LiveSource(
         device,
@@ -79,7 +80,7 @@ def live(device: Path, **options: Any) -> int:
         frames = islice(stack.enter_context(closing(iter(source))), options["n_frames"])
         collector = Collector(configured.screens, configured.file_memory_mb)
         for received in receive(status.watched(frames), configured):
-            result = collector.add(received)
+            result = explained(collector.add(received))
             if options["out"] is not None:
                 result = save_objects(result, options["out"], options["force"], _say, taken)
             write(result)

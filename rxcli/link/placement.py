@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.link.softbits import information
-from rxcli.types import ColumnResult, FloatArray, FrameResult, PacketResult
+from rxcli.types import ColumnResult, FloatArray, FrameResult, PacketResult, Remark
 
 #: Largest shift that is tried, columns; and information from which a column is one of the screen's, relative to that of
 #: the column with the most.
 _MAX_SHIFT, _MIN_INFORMATION = 6, 0.25
-_NOT_READ = "it was taken for no column of the screen until the text was read; give --corners around the whole screen"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +72,7 @@ def _order(placement: Placement) -> tuple[bool, bool]:
 
 def placed(result: FrameResult, placement: Placement, n_columns: int) -> FrameResult:
     """Number the `n_columns` columns of a screen as a decoded message shows; the numbers are then certain."""
-    message = (result.message or "").replace(result.numbering_remark, "").rstrip("; ") or None
+    remarks = tuple(remark for remark in result.remarks if remark.reason != "column_numbers")
     certainty, shift = result.column_certainty, placement.shift
     result = result.with_columns_mirrored() if placement.mirrored else replace(result, mirrored=bool(result.mirrored))
     columns, corners = result.columns, result.corners
@@ -81,10 +80,10 @@ def placed(result: FrameResult, placement: Placement, n_columns: int) -> FrameRe
         columns = tuple(replace(c, packets=tuple(_certain(p, certainty) for p in c.packets)) for c in columns)
     if shift and n_columns > 1:
         by_number = {c.column + shift: replace(c, column=c.column + shift) for c in columns}
-        unread = [ColumnResult(number, "no_packet", message=_NOT_READ) for number in range(n_columns)]
+        unread = [ColumnResult(number, "no_packet", remark=Remark("not_read")) for number in range(n_columns)]
         columns = tuple(by_number.get(column.column, column) for column in unread) if columns else ()
         corners = None if corners is None else _moved(corners, -shift / n_columns)
-    return replace(result, columns=columns, corners=corners, message=message, column_certainty=1.0, column_offset=0)
+    return replace(result, columns=columns, corners=corners, remarks=remarks, column_certainty=1.0, column_offset=0)
 
 
 def _certain(packet: PacketResult, certainty: float) -> PacketResult:

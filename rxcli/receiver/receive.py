@@ -13,7 +13,6 @@ from typing import Any
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.camera.advice import NO_HEADERS
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
@@ -30,10 +29,9 @@ from rxcli.receiver.search.evidence import USUAL_COLUMNS
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.outlines import no_screen, proposed_screens, too_small
 from rxcli.receiver.search.propose import nearest_screen
-from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import Frame, FrameResult, FrameSoftBits, OnTaps
+from rxcli.types import Frame, FrameResult, FrameSoftBits, OnTaps, Remark
 
 
 def receive(frames: Iterable[Frame], options: ReceiverOptions, on_taps: OnTaps | None = None) -> Iterator[FrameResult]:
@@ -84,24 +82,19 @@ def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None
         cache = FrameCache(frame).in_blinking_colours()
         received = receive_either_way(cache, _in_total_order(options), _receive_still)
         soft = _with_cut_packets(cache, received, _in_total_order(options))
-    message = _with_part_in_view(received.result.message, soft)
-    received = received._replace(result=replace(received.result, soft_bits=soft, message=message))
+    remarks = _with_part_in_view(received.result.remarks, soft)
+    received = received._replace(result=replace(received.result, soft_bits=soft, remarks=remarks))
     if on_taps is not None and received.taps:
         on_taps(frame.source, frame.index, received.taps)
     claims = ", ".join(frame.metadata.not_believed) if received.result.packets else ""
-    result = received.with_remark(claims and f"not believed: {claims}").result
-    result = replace(result, message=_with_tried(result, options.screens), timing_ms=cache.timer.total())
-    result = named(result, options)
+    result = received.with_remark(Remark("not_believed", {"claims": claims}) if claims else None).result
+    if result.status == "no_signal" and result.remarks and len(options.screens) == 1:
+        tried = Remark("one_screen_tried", {"screen": options.screens[0].name})
+        result = replace(result, remarks=(*result.remarks, tried))
+    result = named(replace(result, timing_ms=cache.timer.total()), options)
     if options.mirrored:
         return result.with_columns_mirrored()
     return replace(result, mirrored=None if frame.metadata.names_front_camera else False)
-
-
-def _with_tried(result: FrameResult, screens: tuple[ScreenProfile, ...]) -> str | None:
-    """Message of a failure; if only one screen was tried, it names that screen."""
-    if result.status != "no_signal" or result.message is None or len(screens) != 1:
-        return result.message
-    return f"{result.message}; only the screen {screens[0].name} was tried (--screen auto tries all)"
 
 
 def _receive_still(cache: FrameCache, options: ReceiverOptions, least: float) -> Received:
@@ -112,7 +105,7 @@ def _receive_still(cache: FrameCache, options: ReceiverOptions, least: float) ->
         return Received(failed(nothing, screens), {})
     received = [_receive_screen(nothing, cache, outlines, options, least) for outlines in screens]
     clearest = received[0].result
-    if not screens[0][0].stands_out and not clearest.packets and clearest.message != STEADY_LIGHT:
+    if not screens[0][0].stands_out and not clearest.packets and clearest.reason != "steady_light":
         return Received(failed(nothing, no_screen(cache, options)), {})
     best, *less = sorted(received, key=lambda screen: -screen.n_believable)
     other_screens = tuple(screen.result for screen in less if screen.result.packets)
@@ -169,16 +162,19 @@ def _receive_screen(
         soft_bits=soft_bits(frame, reception, no_header, denoised) if options.soft_bits else None,
     )
     if result.status == "no_signal":
-        result = replace(result, message=too_small(context, acquisition.screen) or assemble.why_no_packet(columns))
+        remark = too_small(context, acquisition.screen) or assemble.why_no_packet(columns)
+        result = replace(result, remarks=(remark,))
     elif outline.column_offset is None:
-        result = replace(result, message=result.numbering_remark)
+        leftmost = next((column.column for column in columns if column.packets), 0)
+        facts = {"column": leftmost, "certainty": outline.certainty}
+        result = replace(result, remarks=(Remark("column_numbers", facts),))
     return Received(result, _taps(found, reception))
 
 
 def _with_cut_packets(cache: FrameCache, received: Received, options: ReceiverOptions) -> FrameSoftBits | None:
     """The soft bits of a result; without a believable packet, those of less than a packet come first."""
     result, known = received.result, known_camera(cache.frame, options)
-    own, is_steady = result.soft_bits, STEADY_LIGHT in (result.message or "")
+    own, is_steady = result.soft_bits, result.reason == "steady_light"
     if not options.soft_bits or received.n_believable or is_steady or isinstance(known, Failure):
         return own
     screens = proposed_screens(cache, options)
@@ -191,12 +187,12 @@ def _with_cut_packets(cache: FrameCache, received: Received, options: ReceiverOp
     return None if likeliest is None else replace(likeliest, alternatives=tuple(less_likely))
 
 
-def _with_part_in_view(message: str | None, soft: FrameSoftBits | None) -> str | None:
-    """The message, with the share of a packet in view as the reason where no header was found."""
-    if message is None or soft is None:
-        return message
-    share = float(soft.llr.any(axis=(0, 2, 3)).mean())
-    return message.replace(NO_HEADERS, f"less than a packet is in view: {assemble.further_pictures(share)}")
+def _with_part_in_view(remarks: tuple[Remark, ...], soft: FrameSoftBits | None) -> tuple[Remark, ...]:
+    """The remarks, with the share of a packet in view as the reason where no header was found."""
+    if soft is None:
+        return remarks
+    part = Remark("part_in_view", {"share": float(soft.llr.any(axis=(0, 2, 3)).mean())})
+    return tuple(part if remark.reason == "no_headers" else remark for remark in remarks)
 
 
 def _of_columns(result: FrameResult, options: ReceiverOptions) -> tuple[ScreenProfile, ...]:

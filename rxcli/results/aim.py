@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from rxcli.errors import printable, sentence
-from rxcli.receiver.decode.assemble import OUT_OF_VIEW
-from rxcli.types import FloatArray, Frame, FrameResult
+from rxcli.results.reasons import sentence_of
+from rxcli.types import FloatArray, Frame, FrameResult, Reason, Remark
 
 #: Rates are averages over this time, seconds.
 WINDOW_S = 1.0
@@ -20,12 +20,13 @@ _DARK, _BRIGHT, _WASHED_OUT = 0.06, 0.1, 0.4
 #: 1080), and share of the columns below which motion matters at all.
 _STILL, _FEW = 0.01, 0.5
 _CLOSER = "Move closer, until the screen fills the picture."
+_NEARER = f"{_CLOSER[:-1]}, and hold the camera level with it."
 _TURN = "Turn the camera, until its long side lies along the screen's."
-#: For those who aim: part of a message that was written for photos -> reason and next step.
-_AIMING = {
-    "in portrait": ("The screen lies on its side in the picture.", _TURN),
-    "only a part of": ("Only a part of the picture shows stripes.", _CLOSER),
-    "no columns of": ("No screen that sends is in view.", f"{_CLOSER[:-1]}, and hold the camera level with it."),
+#: For those who aim: reason and next step, instead of those of photos.
+_AIMING: dict[Reason | None, tuple[str, str]] = {
+    **dict.fromkeys(("portrait", "on_its_side"), ("The screen lies on its side in the picture.", _TURN)),
+    **dict.fromkeys(("no_columns", "lit"), ("No screen that sends is in view.", _NEARER)),
+    "part_striped": ("Only a part of the picture shows stripes.", _CLOSER),
 }
 _WORDS = {"no_screen": "no screen", "no_signal": "no signal", "unreadable": "no picture"}
 
@@ -110,10 +111,10 @@ class Aim:
             self._recent.popleft()
         locked = result.status in _LOCKED
         reason, advice = ("", "") if locked else aiming_hint(result, light)
-        n_hidden = sum(column.message == OUT_OF_VIEW for column in result.columns)
+        n_hidden = sum(column.reason == "out_of_view" for column in result.columns)
         if locked and n_hidden:
             reason = f"{n_hidden} of the screen's columns are out of the picture."
-            advice = sentence(OUT_OF_VIEW.partition("; ")[2])
+            advice = sentence(sentence_of(Remark("out_of_view")).partition("; ")[2])
         n_received = sum(column.status in ("ok", "weak") for column in result.columns) if locked else 0
         moved = self._moved(result.corners, height)
         if moved > _STILL and n_received <= _FEW * len(result.columns):
@@ -160,8 +161,7 @@ def aiming_hint(result: FrameResult, light: Brightness | None = None) -> tuple[s
             return "The picture is too dark.", "Expose longer, raise the gain, or show a brighter picture."
         if light.clipped > _BRIGHT or light.mean > _WASHED_OUT:
             return "The picture is so bright that stripes fade.", "Expose shorter."
-    found = (hint for part, hint in _AIMING.items() if part in (result.message or ""))
-    reason, advice = next(found, None) or split_message(result)
+    reason, advice = _AIMING.get(result.reason) or split_message(result)
     return reason, _CLOSER if "closer so" in advice or advice == "Move closer." else advice
 
 
@@ -171,5 +171,5 @@ def split_message(result: FrameResult) -> tuple[str, str]:
     Messages are `what; next step`, see `rxcli.errors`; parts of the headline are left out.
     """
     text = printable((result.message or "no packet was found").removeprefix(result.source + ": "))
-    reason, _, advice = text.removeprefix("no screen found: ").partition("; ")
+    reason, _, advice = text.partition("; ")
     return sentence(reason), sentence(advice)

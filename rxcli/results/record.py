@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any, get_type_hints
 
 from rxcli.errors import UsageError
-from rxcli.types import ColumnResult, FrameResult, Message, ObjectProgress, PacketResult, ReceivedObject
+from rxcli.types import ColumnResult, FrameResult, Message, ObjectProgress, PacketResult, Reason, ReceivedObject, Remark
 
 #: Fields of a record in their order, with the decimals that are written; None: as it is, `_SIGNIFICANT`: seven digits.
 _SIGNIFICANT = -1
@@ -25,7 +25,7 @@ _OF_SCREEN = ("inferred_sides", "column_certainty", "column_offset", "mirrored",
 
 def to_record(result: FrameResult) -> dict[str, Any]:
     """The result as plain data in the order of the documented JSON shape; unknown or non-finite values are None."""
-    record = _written(result, _FRAME) | _present(result, "message")
+    record = _written(result, _FRAME) | _present(result, "reason", "message")
     corners = [] if result.corners is None else [[_rounded(x, 2) for x in corner] for corner in result.corners.tolist()]
     record["screen"] = {"profile": result.screen_profile, "corners": corners or None, **_numbering(result)}
     record["camera"] = {
@@ -35,7 +35,7 @@ def to_record(result: FrameResult) -> dict[str, Any]:
     record["columns"] = [
         _written(column, _COLUMN)
         | {"packets": [_written(p, _PACKET) | _present(p, "burst", "frames") for p in column.packets]}
-        | _present(column, "message")
+        | _present(column, "reason", "message")
         for column in result.columns
     ]
     record["timing_ms"] = {stage: _rounded(value, 2) for stage, value in result.timing_ms.items()}
@@ -129,7 +129,8 @@ def from_record(record: dict[str, Any]) -> FrameResult:
             {**record, **about},
             FrameResult,
             corners=None if corners is None else np.array(corners, dtype=np.float64).reshape(4, 2),
-            columns=tuple(_read(c, ColumnResult, packets=tuple(map(_packet, c["packets"]))) for c in record["columns"]),
+            columns=tuple(map(_column, record["columns"])),
+            remarks=tuple(filter(None, (_remark(record),))),
             other_screens=tuple(map(from_record, record.get("other_screens", ()))),
             messages=tuple(messages),
             objects=tuple(_read(file, ReceivedObject, data=b"") for file in files),
@@ -140,6 +141,21 @@ def from_record(record: dict[str, Any]) -> FrameResult:
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         shown = f"{error!r:.200}"
         raise UsageError(f"not a result line of `vlc-rx decode --json` ({shown})", "name another file") from None
+
+
+def _column(record: dict[str, Any]) -> ColumnResult:
+    column: ColumnResult = _read(
+        record, ColumnResult, packets=tuple(map(_packet, record["packets"])), remark=_remark(record)
+    )
+    return column
+
+
+def _remark(record: dict[str, Any]) -> Remark | None:
+    """The reason of a frame or a column; what was measured of it stands in the message alone."""
+    import msgspec
+
+    reason = record.get("reason")
+    return None if reason is None else Remark(msgspec.convert(reason, Reason))
 
 
 def _packet(record: dict[str, Any]) -> PacketResult:

@@ -28,6 +28,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.outputs import OUTPUT_MARKER
 from rxcli.profiles import ScreenProfile
 from rxcli.results.dump import plain_name, taps_writer
+from rxcli.results.reasons import explained
 from rxcli.runs.processes import ONE_THREAD, environment, start_process
 from rxcli.types import FILE_MEMORY_MB, Frame, FrameResult
 
@@ -180,7 +181,7 @@ class Decoder:
         A photograph without any keeps its soft bits, for others may show the same.
         """
         if not self.link_screens:
-            yield from results
+            yield from map(explained, results)
             return
         collector = Collector(self.link_screens, self.file_memory_mb)
         for number, (result, last) in enumerate(with_last(results)):
@@ -189,7 +190,7 @@ class Decoder:
                 taken = collector.finish(taken)
                 alone = number == 0 and not (taken.messages or taken.objects)
                 taken = replace(taken, soft_bits=result.soft_bits if alone else None)
-            yield taken
+            yield explained(taken)
 
     def _frames(self, source: Source, problems: list[str]) -> Iterator[Frame]:
         """The frames of a source up to a failure, which joins `problems`: the receiver still gives what it holds."""

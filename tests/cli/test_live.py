@@ -234,7 +234,7 @@ class TestStatus:
         expected = "LOCKED | columns 15/20 | 4.0 frames/s | 40 packets/s | 4.0 kb/s | BER about 1.0e-02 | "
         assert capsys.readouterr().err.splitlines()[-1] == expected + "dropped 7 | damaged 2"
         assert status.n_packets == 50
-        status.update(FrameResult("/dev/video0", 1, 0.1, "no_screen", "no screen found: it is black; expose longer"))
+        status.update(FrameResult("/dev/video0", 1, 0.1, "no_screen", "it is black; expose longer"))
         line = capsys.readouterr().err.splitlines()[-1]
         assert line.startswith("no screen | columns 0/0")
         assert line.endswith("It is black. Expose longer.")
@@ -277,7 +277,7 @@ class TestStatus:
 
 @pytest.mark.parametrize("width", [30, 99])
 def test_nothing_of_the_status_is_cut_off_by_a_narrow_terminal(width: int) -> None:
-    reason = "no screen found: no area with stripes was found; use the electronic shutter and a short exposure"
+    reason = "no area with stripes was found; use the electronic shutter and a short exposure"
     lines = format_status(Aim().update(FrameResult("a", 0, 0.0, "no_screen", reason), 0.0, 1000), CameraCounts())
     fitted = wrapped("\n".join(lines), width).split("\n")
     assert max(map(len, fitted)) <= width

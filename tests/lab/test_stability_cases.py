@@ -195,7 +195,7 @@ def test_tiny_pictures(height: int, width: int, given: bool) -> None:
     options = replace(base.options(), cameras=(msgspec.structs.replace(base.camera, modes=(mode,)),))
     result = received(frame, options if given else replace(options, corners=None))
     assert result.status in {"no_screen", "no_signal"}
-    assert result.message
+    assert result.reason
 
 
 def test_the_order_of_threads_changes_nothing() -> None:

@@ -17,7 +17,7 @@ from rxcli.link.placement import Placement, possible_placements
 from rxcli.link.receiver import LinkReceiver
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.runs.api import Receiver
-from rxcli.types import ColumnResult, Frame, FrameResult, FrameSoftBits, Metadata, PacketResult
+from rxcli.types import ColumnResult, Frame, FrameResult, FrameSoftBits, Metadata, PacketResult, Remark
 
 SCREEN = load_profile("paper-34k6", ScreenProfile)
 NO = Placement()
@@ -34,8 +34,8 @@ def result(soft: FrameSoftBits, placement: Placement = NO, source: str = "a") ->
     columns = tuple(ColumnResult(c, "ok", packets=packets if c == ninth else ()) for c in range(COLUMNS))
     corners = np.array([[0, 0], [20, 0], [20, 10], [0, 10]], float)
     told = replace(FrameResult(source, 0, 0.0, "ok", columns=columns), column_certainty=0.5, column_offset=None)
-    message = f"bright; {told.numbering_remark}"
-    return replace(told, screen_profile=SCREEN.name, corners=corners, soft_bits=soft, message=message)
+    remarks = (Remark("not_believed"), Remark("column_numbers"))
+    return replace(told, screen_profile=SCREEN.name, corners=corners, soft_bits=soft, remarks=remarks)
 
 
 @pytest.mark.parametrize("placement", PLACEMENTS)
@@ -48,10 +48,10 @@ def test_a_text_shows_how_the_columns_of_its_picture_lie(placement: Placement) -
     assert [column.column for column in got.columns] == list(range(COLUMNS))
     assert [column.column for column in got.columns if column.packets] == [9]
     unread = range(placement.shift) if placement.shift > 0 else range(COLUMNS + placement.shift, COLUMNS)
-    assert [column.column for column in got.columns if "--corners" in (column.message or "")] == list(unread)
+    assert [column.column for column in got.columns if column.reason == "not_read"] == list(unread)
     # What was uncertain by its number alone is certain.
     assert got.columns[9].packets[0].confidence == 0.8
-    assert (got.column_certainty, got.column_offset, got.message) == (1.0, 0, "bright")
+    assert (got.column_certainty, got.column_offset, got.remarks) == (1.0, 0, (Remark("not_believed"),))
     left = -placement.shift if not placement.mirrored else COLUMNS + placement.shift
     assert got.corners[0].tolist() == pytest.approx([left, 0], abs=1e-4)
     # What is known of one camera says nothing of another one.

@@ -14,6 +14,7 @@ from rxcli.options import receiver_options
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import encode_packet
 from rxcli.receiver.receive import receive
+from rxcli.results.reasons import explained
 from rxcli.types import Frame, FrameResult
 
 SCREEN = load_profile("paper-17k3", ScreenProfile)
@@ -57,7 +58,8 @@ def received(made: tuple[Scene, list[Capture]], *, known: bool, corners: bool = 
         options = replace(options, cameras=(build_camera_profile(scene, captures[0].exposure),), force_camera=True)
     if corners:
         options = replace(options, corners=captures[0].exposure.corners)
-    return list(receive([Frame(one.pixels, "drawn", one.frame, one.time_s) for one in captures], options))[-1]
+    results = receive([Frame(one.pixels, "drawn", one.frame, one.time_s) for one in captures], options)
+    return explained(list(results)[-1])
 
 
 @pytest.mark.parametrize(("n_frames", "known"), [(1, False), (1, True), (3, True)])
@@ -81,9 +83,9 @@ def test_one_column_alone_is_received_and_named(n_frames: int) -> None:
         assert (result.message or "").endswith("column 7 alone sends")
 
 
-@pytest.mark.parametrize(("n_lit", "says"), [(4, "lit without slots"), (2, "switched on and off steadily")])
-def test_a_screen_that_is_lit_or_half_lit_is_named(n_lit: int, says: str) -> None:
+@pytest.mark.parametrize(("n_lit", "reason"), [(4, "lit"), (2, "steady_light")])
+def test_a_screen_that_is_lit_or_half_lit_is_named(n_lit: int, reason: str) -> None:
     slots = np.tile((np.arange(2000) % 4 < n_lit).astype(np.float64), (20, 1))
     result = received(filmed_light(slots, 1), known=False)
     assert not result.packets
-    assert says in (result.message or "")
+    assert result.reason == reason

@@ -24,6 +24,7 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.receive import receive
 from rxcli.receiver.screen.registration import ScreenTexture
 from rxcli.receiver.sync.tracking import LinkTime
+from rxcli.results.reasons import explained
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Frame, FrameResult
 
@@ -68,7 +69,7 @@ def received(clip: Clip, frames: tuple[Frame, ...] | None = None, **changes: obj
     own, truth, options = clip
     scorer = Scorer(truth)
     chosen = replace(options, **changes)  # type: ignore[arg-type]
-    results = [scorer.add(result) for result in receive(own if frames is None else frames, chosen)]
+    results = [scorer.add(result) for result in map(explained, receive(own if frames is None else frames, chosen))]
     return results, scorer.score()
 
 
@@ -174,7 +175,7 @@ def test_a_screen_that_leaves_the_picture_and_comes_back(shaky: Clip) -> None:
     frames, truth, _ = shaky
     wall = np.random.default_rng(1).integers(60, 64, frames[0].pixels.shape, np.uint8)
     results, score = received(shaky, (*frames[:4], *(replace(f, pixels=wall) for f in frames[4:6]), *frames[6:]))
-    assert all(r.status in ("no_screen", "no_signal") and r.message for r in results[4:6])
+    assert all(r.status in ("no_screen", "no_signal") and r.reason for r in results[4:6])
     gone = sum(4 <= f.frame < 6 for f in truth.frames) * 20
     assert score.error_free >= 0.9 * (score.expected - gone)
     assert surely_wrong(results) == 0
@@ -199,7 +200,7 @@ def test_a_frame_shown_twice_is_left_out(shaky: Clip) -> None:
     frames = tuple(replace(shaky[0][k], index=n) for n, k in enumerate(twice))
     results = list(receive(frames, shaky[2]))
     assert [n for n, result in enumerate(results) if "doubled_frames" in result.skipped] == [4, 9]
-    assert all("once more" in (results[n].message or "") for n in (4, 9))
+    assert all(results[n].reason == "doubled" for n in (4, 9))
     scorer = Scorer(shaky[1])
     marked = [scorer.add(replace(r, frame=twice[r.frame])) for n, r in enumerate(results) if n not in (4, 9)]
     assert scorer.score().error_free >= 0.9 * scorer.score().expected

@@ -26,6 +26,7 @@ from rxcli.receiver.plane.orientation import as_received
 from rxcli.receiver.receive import receive, receive_frame
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.still import initial_pass
+from rxcli.results.reasons import explained
 from rxcli.results.truth import Score, Scorer, Truth
 from rxcli.types import Clock, Frame, FrameResult, Metadata, Mosaic, PacketResult
 
@@ -79,7 +80,7 @@ def frame_of(taken: Capture, pixels: NDArray[np.uint8] | None = None, orientatio
 
 def received(frame: Frame, options: ReceiverOptions) -> FrameResult:
     (result,) = receive([frame], options)
-    return result
+    return explained(result)
 
 
 def score_of(result: FrameResult, taken: Capture) -> Score:

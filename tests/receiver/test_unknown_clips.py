@@ -26,7 +26,7 @@ from rxcli.receiver.search import Found, cameras
 from rxcli.receiver.search.outlines import possible_screens
 from rxcli.receiver.still import decode
 from rxcli.results.truth import Truth
-from rxcli.types import Frame, FrameResult, Metadata
+from rxcli.types import Frame, FrameResult, Metadata, Remark
 from tests.receiver.test_video import Clip, scored, simulate
 
 N_FRAMES = 5
@@ -202,8 +202,8 @@ class _Shown(Located):
         (_Shown(100), _Shown(210, reaches_out=True), False),
         (_Shown(100, is_long=True), _Shown(110), True),
         (_Shown(100), _Shown(110, is_long=True), True),
-        (Failure("no_signal", "none"), _Shown(50), False),
-        (Failure("no_signal", "none"), Failure("no_screen", "none"), True),
+        (Failure(Remark("no_stripes")), _Shown(50), False),
+        (Failure(Remark("no_stripes")), Failure("no_screen", "none"), True),
     ],
 )
 def test_a_lost_screen_is_where_more_packets_are(

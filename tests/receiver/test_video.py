@@ -141,7 +141,7 @@ def test_an_occluded_frame_costs_its_own_packets_only(clip: Clip) -> None:
     dark = replace(clip.frames[7], pixels=np.full_like(clip.frames[7].pixels, 20))
     got = list(receive((*clip.frames[:7], dark, *clip.frames[8:]), clip.options))
     assert got[7].status in ("no_signal", "no_screen")
-    assert got[7].message
+    assert got[7].reason
     marked, score = scored(got, clip.truth)
     assert score.false <= 1
     after = [p for r in marked[8:] for c in r.columns for p in c.packets]

@@ -39,7 +39,7 @@ OK = FrameResult(
     ),
     timing_ms={"ingest": 118.0, "total": 150.2},
 )
-LOST = FrameResult("b.jpg", 0, 0.0, "no_screen", message="no screen found; give --corners")
+LOST = FrameResult("b.jpg", 0, 0.0, "no_screen", message="no columns were found; give --corners")
 BAD = FrameResult("c.jpg", 0, 0.0, "unreadable", message="c.jpg: the file is empty; copy it again")
 
 
@@ -262,7 +262,7 @@ def test_junit(tmp_path: Path) -> None:
     assert [(part.tag, part.text) for part in passed] == [("system-out", "2 packets received")]
     assert float(str(passed.get("time"))) == pytest.approx(0.150)
     assert "the file is empty" in str(error.find("error").get("message"))
-    assert "no screen found" in str(failure.find("failure").get("message"))
+    assert "no columns were found" in str(failure.find("failure").get("message"))
     assert str(failure.get("name")).endswith("<&>.jpg")
 
 

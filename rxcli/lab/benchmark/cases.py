@@ -303,9 +303,9 @@ def nonsense(result: FrameResult) -> Iterator[str]:
                 yield f"confidence {packet.confidence}, ber_hat {packet.ber_hat} out of 0..1"
             if len(packet.payload) != 2 * -(-packet.payload_bits // 8):
                 yield f"payload of {len(packet.payload)} hex digits for {packet.payload_bits} bits"
-        if not column.packets and not column.message:
+        if not column.packets and not column.remark:
             yield f"column {column.column} has neither packet nor message"
-    if not result.columns and not result.message:
+    if not result.columns and not result.remarks:
         yield "neither columns nor message"
 
 

@@ -19,12 +19,7 @@ from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.framing import Framing, framing_of
 from rxcli.receiver.search.settings import SETTINGS as search_settings
 from rxcli.receiver.still import initial_pass
-from rxcli.types import FloatArray, Frame
-
-_UNLIKE = (
-    "rows are {:.3f} times as quick as the named camera's, as in clips that were stabilised or cropped: the camera was "
-    "estimated instead; switch stabilisation off for the best"
-)
+from rxcli.types import FloatArray, Frame, Remark
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,9 +116,9 @@ class ClipCamera:
     options: ReceiverOptions
     #: A frame with the camera and the screens that remain; None before any.
     context: FrameContext | None = None
-    #: Whether the camera's profile was compared with the clip, and a message about it.
+    #: Whether the camera's profile was compared with the clip, and a remark about it.
     is_compared: bool = False
-    message: str | None = None
+    remark: Remark | None = None
 
     def fits(self, frame: Frame) -> bool:
         """Whether a frame is of the kind that the camera is known for."""
@@ -220,7 +215,7 @@ class ClipCamera:
         if isinstance(estimated, Failure) or estimated.best.evidence < max(search_settings.few_packets, enough):
             return compared, found
         stretch = context.camera.line_delay_s / estimated.best.context.camera.line_delay_s
-        return replace(compared, options=options, message=_UNLIKE.format(stretch)), estimated
+        return replace(compared, options=options, remark=Remark("stabilised", {"stretch": stretch})), estimated
 
 
 def _framing_of(found: Found) -> Framing:

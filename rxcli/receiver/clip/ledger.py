@@ -13,13 +13,7 @@ from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.timeline import Timeline
 from rxcli.receiver.clip.views import View, Waiting
-from rxcli.types import Frame, FrameResult, OnTaps
-
-_SLOW_MOTION = "slow motion: time stamps are {:g} times as long as the link's time, which was taken"
-_RETIMED = (
-    "the clip's time stamps do not fit the link's time, as after a change of its speed: each frame is received alone; "
-    "give the clip as the camera recorded it"
-)
+from rxcli.types import Frame, FrameResult, OnTaps, Remark
 
 
 class Ledger:
@@ -62,11 +56,11 @@ class Ledger:
         return self._timeline
 
     @property
-    def message(self) -> str | None:
-        """Message about the clip's time stamps, or None."""
+    def remarks(self) -> tuple[Remark, ...]:
+        """About the clip's time stamps."""
         if self._stretch is None:
-            return _RETIMED
-        return _SLOW_MOTION.format(self._stretch) if self._stretch != 1 else None
+            return (Remark("retimed"),)
+        return (Remark("slow_motion", {"stretch": self._stretch}),) if self._stretch != 1 else ()
 
     def has_certain_bursts(self, frame: Frame, scene: TrackedScreen) -> bool:
         """Whether all bursts that a frame should show are certain in all lit columns."""
@@ -126,7 +120,7 @@ class Ledger:
         waiting, scene, done = self._waiting, self._scene, []
         self._stretch, self._waiting, self._timeline = stretch, deque(), None
         for each in waiting:
-            each.update(message=self.message)
+            each.update(remarks=self.remarks)
             if each.view is not None:
                 each.view.numbers = None
             done += self.add(each) if each.view is None else self.enter(each, each.view, scene)

@@ -27,13 +27,8 @@ from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.light import slot_llr
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found
-from rxcli.receiver.search.refusal import STEADY_LIGHT
 from rxcli.receiver.still import apply_autoencoder, decode
-from rxcli.types import FloatArray, Frame, FrameResult, OnTaps
-
-_SAME = "it shows the frame before once more, so that its time is not that of its rows; it was left out"
-_NOTHING_LIT = "no light of the screen's columns is seen; something may be in front of it"
-_NOMINAL_TIME = "the clip's time stamps do not advance here; its nominal frame rate was taken"
+from rxcli.types import FloatArray, Frame, FrameResult, OnTaps, Reason, Remark
 
 
 def receive_clip(
@@ -183,13 +178,13 @@ def _receive_first(known: Known, held: FirstFrames, located: Located) -> _Step:
 def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | None = None) -> _Step:
     """Receive a frame by what is known, or like a photograph where that does not fit; `located` where it is."""
     cache, ledger, before = FrameCache(frame), state.known.ledger, state.known.frame
-    message = _NOMINAL_TIME if frame.nominal_time else ledger.message
-    waiting = Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok", message=message))
+    remarks = (Remark("nominal_times"),) if frame.nominal_time else ledger.remarks
+    waiting = Waiting(FrameResult(frame.source, frame.index, frame.time_s, "ok", remarks=remarks))
     reason = _reason_to_skip(state, frame, before)
     state = replace(state, known=replace(state.known, frame=frame))
     if reason is not None:
-        counter, message = reason
-        waiting.update(skipped={counter: 1}, message=message)
+        counter, remark = reason
+        waiting.update(skipped={counter: 1}, remarks=(Remark(remark),))
         return state, ledger.add(waiting)
     view: View | Failure | None = None
     if isinstance(state, Tracking) and state.known.camera.fits(frame):
@@ -201,11 +196,11 @@ def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | 
         state, view, report = _receive_anew(state.known, cache, located)
         waiting.update(denoiser=report)
     if isinstance(view, Failure):
-        waiting.update(status=view.status, message=view.message, timing_ms=cache.timer.total())
+        waiting.update(status=view.status, remarks=(view.remark,), timing_ms=cache.timer.total())
         return state, ledger.add(waiting, scene_ends=True)
     waiting.update(
         **view.context.result_fields,
-        message=message or state.known.camera.message,
+        remarks=remarks or tuple(filter(None, (state.known.camera.remark,))),
         screen_profile=view.acquisition.screen.name,
         corners=state.known.corners,
     )
@@ -214,13 +209,13 @@ def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | 
     return state, results
 
 
-def _reason_to_skip(state: Tracking | Lost, frame: Frame, before: Frame | None) -> tuple[str, str] | None:
-    """Counter and message of a frame that need not be received; None of others."""
+def _reason_to_skip(state: Tracking | Lost, frame: Frame, before: Frame | None) -> tuple[str, Reason] | None:
+    """Counter and reason of a frame that need not be received; None of others."""
     ledger, options = state.known.ledger, state.known.camera.options
     if "tracking" in options.skip and before is not None and _is_doubled(frame, before, state.known.corners):
-        return "doubled_frames", _SAME
+        return "doubled_frames", "doubled"
     if options.stop_when_certain and isinstance(state, Tracking) and ledger.has_certain_bursts(frame, state.scene):
-        return "certain_frames", "its bursts are certain from the frames before"
+        return "certain_frames", "certain_before"
     return None
 
 
@@ -279,9 +274,9 @@ def _receive_anew(
             reception, denoised, report = apply_autoencoder(acquisition, reception, options)
     # Of long exposures packets were compared with arbitrary slots already.
     if ledger.start is None and not reception.is_long and shows_steady_light(reception):
-        return Lost(known), Failure("no_signal", STEADY_LIGHT), None
+        return Lost(known), Failure(Remark("steady_light")), None
     if assemble.all_dark(reception.snr):
-        return Lost(known), Failure("no_signal", _NOTHING_LIT), None
+        return Lost(known), Failure(Remark("nothing_lit")), None
     known = replace(known, outline=located.outline)
     metrics = reception.metrics
     if is_joint:

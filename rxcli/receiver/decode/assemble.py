@@ -21,16 +21,9 @@ from rxcli.types import (
     FrameStatus,
     IntArray,
     PacketResult,
+    Remark,
     SlotSamples,
 )
-
-_HEADERLESS = (
-    "no packet header shows where this screen's packets have one; the screen may be another one (--screen auto tries "
-    "all), its place wrong (--corners), or the column overexposed"
-)
-ECHO = "it shows nothing but the light of the column beside it; show a brighter picture there"
-OUT_OF_VIEW = "it is out of the picture; turn the camera, or move back, until the whole screen is in view"
-_GOES_ON = "its burst goes on in the next frame and is reported there"
 
 
 @dataclass(frozen=True)
@@ -177,16 +170,17 @@ def _columns(frame: FrameColumns, bursts: Sequence[_Burst], goes_on: Callable[[i
         if not packets and not headerless[column] and goes_on(column):
             status = "ok"
         if packets:
-            message = None
+            remark = None
         elif status == "ok" or not bursts:
-            message = _GOES_ON
+            remark = Remark("goes_on")
         else:
-            message = ECHO if any(burst.echo[column] for burst in bursts) else None
-            message = _HEADERLESS if headerless[column] else message or _withheld(confidence, min_confidence)
+            remark = Remark("echo") if any(burst.echo[column] for burst in bursts) else None
+            remark = remark or _withheld(confidence, min_confidence)
+            remark = Remark("headerless") if headerless[column] else remark
             if any(burst.whole[column] for burst in bursts):
-                message = message or _light_reason(status, db)
+                remark = remark or _light_reason(status, db)
             else:
-                message = _incomplete_reason(np.stack([burst.n_observed[column] for burst in bursts]))
+                remark = _incomplete_reason(np.stack([burst.n_observed[column] for burst in bursts]))
         out.append(
             ColumnResult(
                 column=column,
@@ -196,41 +190,30 @@ def _columns(frame: FrameColumns, bursts: Sequence[_Burst], goes_on: Callable[[i
                 snr_db=db,
                 delay_slots=float(frame.clock.delay_slots[column]),
                 packets=packets,
-                message=message,
+                remark=remark,
             )
         )
     return tuple(out)
 
 
-def _withheld(confidence: float, min_confidence: float) -> str | None:
-    """Message for a column whose surest packet is below the minimum confidence, or None."""
+def _withheld(confidence: float, min_confidence: float) -> Remark | None:
+    """Remark on a column whose surest packet is below the minimum confidence, or None."""
     if not 0 < confidence < min_confidence:
         return None
-    return f"its packet has a confidence of {confidence:.4f}, below the {min_confidence:g} asked for (--min-confidence)"
+    return Remark("withheld", {"confidence": confidence, "min_confidence": min_confidence})
 
 
-def _incomplete_reason(n_observed: IntArray) -> str:
-    """Message for a column without a complete packet; `n_observed` is (B, packet)."""
+def _incomplete_reason(n_observed: IntArray) -> Remark:
+    """Remark on a column without a complete packet; `n_observed` is (B, packet)."""
     if not n_observed.any():
-        return OUT_OF_VIEW
+        return Remark("out_of_view")
     missing = int((n_observed[:, PREAMBLE_SLOTS:] == 0).sum(axis=1).min())
-    return (
-        f"no packet is in view as a whole: of {n_observed.shape[1]} slots {missing} are missing; "
-        f"{further_pictures(float((n_observed > 0).mean(axis=1).max()))}, or move closer so that the screen fills more "
-        "of the height"
-    )
+    facts = {"slots": n_observed.shape[1], "missing": missing, "share": float((n_observed > 0).mean(axis=1).max())}
+    return Remark("incomplete", facts)
 
 
-def further_pictures(share: float) -> str:
-    """What to do if a picture shows a share of a packet: further ones show the rest of a text."""
-    n = int(np.ceil(1 / max(share, 0.05)))
-    return f"a picture shows {100 * share:.0f} % of a packet: send {n} more photo{'s' if n > 1 else ''}, or film"
-
-
-def _light_reason(status: ColumnStatus, snr_db: float | None) -> str:
-    if status == "dark" or snr_db is None:
-        return "too little light under this column; show a brighter picture or raise the exposure"
-    return f"too many slots are uncertain at {snr_db:.1f} dB; show a brighter picture or hold the camera closer"
+def _light_reason(status: ColumnStatus, snr_db: float | None) -> Remark:
+    return Remark("dark") if status == "dark" or snr_db is None else Remark("uncertain", {"snr_db": snr_db})
 
 
 def _column_status(packets: tuple[PacketResult, ...], snr_db: float | None) -> ColumnStatus:
@@ -257,10 +240,10 @@ def clip_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:
     return "ok" if all(column.status in ("ok", "weak", "dark") for column in columns) else "partial"
 
 
-def why_no_packet(columns: tuple[ColumnResult, ...]) -> str:
-    """Message of a frame without packets: the reason of its clearest column."""
+def why_no_packet(columns: tuple[ColumnResult, ...]) -> Remark:
+    """Remark on a frame without packets: the reason of its clearest column."""
     clearest = max(columns, key=lambda column: -np.inf if column.snr_db is None else column.snr_db)
-    return f"no column gave a packet; column {clearest.column} is the clearest: {clearest.message}"
+    return Remark("no_column", {"column": clearest.column, "why": clearest.remark})
 
 
 def frame_status(columns: tuple[ColumnResult, ...]) -> FrameStatus:

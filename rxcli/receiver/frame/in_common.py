@@ -7,8 +7,7 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.decode.assemble import ECHO
-from rxcli.types import ColumnResult, FrameResult
+from rxcli.types import ColumnResult, FrameResult, Remark
 
 #: Smallest number of columns that can send the same: a lit one is seen in both its neighbours.
 _MIN_COLUMNS = 4
@@ -17,15 +16,9 @@ _ONE_COLUMN = 0.3
 #: Share of the sending columns that have a packet in common where all send the same: some may be received wrong.
 _COMMON = 0.75
 
-ALL_THE_SAME = "all columns send the same"
-_ONE_ALONE = (
-    "one column alone sends, so that the screen's sides and the column's number do not show; give the screen's corners "
-    "(--corners) to have its number"
-)
-
 
 def named(result: FrameResult, options: ReceiverOptions) -> FrameResult:
-    """The result with a message where all columns send the same, or one alone."""
+    """The result with a remark where all columns send the same, or one alone."""
     screen = next((screen for screen in options.screens if screen.name == result.screen_profile), None)
     sending = [column for column in result.columns if any(packet.is_believable for packet in column.packets)]
     if screen is None or screen.columns < _MIN_COLUMNS or not sending:
@@ -33,15 +26,17 @@ def named(result: FrameResult, options: ReceiverOptions) -> FrameResult:
     payloads = Counter(packet.payload for column in sending for packet in column.packets)
     if max(payloads.values()) < _COMMON * len(sending):
         return result
-    number, message = sending[0].column, None
+    number = sending[0].column
     if options.corners is None and _is_one_column(result, screen):
         best = max(sending, key=lambda column: max(packet.confidence for packet in column.packets))
-        result, message = replace(result, columns=(replace(best, column=0),), status="ok"), _ONE_ALONE
+        result, remark = replace(result, columns=(replace(best, column=0),), status="ok"), Remark("one_column")
     elif len(sending) == 1 and all(_is_unlit(column) for column in result.columns if column.column != number):
-        message = f"column {number} alone sends"
+        remark = Remark("column_alone", {"column": number})
     elif len(sending) >= _MIN_COLUMNS:
-        message = ALL_THE_SAME
-    return replace(result, message="; ".join(filter(None, (result.message, message))) or None)
+        remark = Remark("all_the_same")
+    else:
+        return result
+    return replace(result, remarks=(*result.remarks, remark))
 
 
 def _is_one_column(result: FrameResult, screen: ScreenProfile) -> bool:
@@ -52,4 +47,4 @@ def _is_one_column(result: FrameResult, screen: ScreenProfile) -> bool:
 
 
 def _is_unlit(column: ColumnResult) -> bool:
-    return column.status == "dark" or column.message == ECHO
+    return column.status == "dark" or column.reason == "echo"

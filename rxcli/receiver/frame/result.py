@@ -7,15 +7,15 @@ from typing import Any, Literal, NamedTuple
 
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.screen.outline import Outline
-from rxcli.types import BELIEVABLE, FrameResult, PacketResult
+from rxcli.types import BELIEVABLE, FrameResult, PacketResult, Reason, Remark
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """End of a reception without packets: status, reason and next step."""
+    """End of a reception without packets: reason, what was measured of it, and status."""
 
-    status: Literal["no_screen", "no_signal"]
-    message: str
+    remark: Remark
+    status: Literal["no_screen", "no_signal"] = "no_signal"
     #: Estimates of the camera: name -> (value, standard deviation).
     estimated: dict[str, tuple[float, float]] = field(default_factory=dict)
     #: The best outline and camera.
@@ -23,6 +23,11 @@ class Failure:
     context: FrameContext | None = None
     #: Every hypothesis that was scored, see `search.Tried`.
     tried: tuple[Any, ...] = ()
+
+    @property
+    def reason(self) -> Reason:
+        """Why nothing was received."""
+        return self.remark.reason
 
 
 def is_received(packet: PacketResult, result: FrameResult) -> bool:
@@ -41,13 +46,13 @@ class Received(NamedTuple):
         """Number of packets that are believable."""
         return sum(is_received(packet, self.result) for packet in self.result.packets)
 
-    def with_remark(self, remark: str | None) -> Received:
-        """The same with a remark before the message, if there is one."""
-        return self.with_message("; ".join(filter(None, (remark, self.result.message))) or None)
+    def with_remark(self, remark: Remark | None) -> Received:
+        """The same with a remark before the others, if there is one."""
+        return self if remark is None else self.with_remarks(remark, *self.result.remarks)
 
-    def with_message(self, message: str | None) -> Received:
-        """The same with another message."""
-        return self._replace(result=replace(self.result, message=message))
+    def with_remarks(self, *remarks: Remark) -> Received:
+        """The same with other remarks."""
+        return self._replace(result=replace(self.result, remarks=remarks))
 
 
 def failed(result: FrameResult, failure: Failure) -> FrameResult:
@@ -60,7 +65,7 @@ def failed(result: FrameResult, failure: Failure) -> FrameResult:
         result,
         search=tuple(tried.step for tried in failure.tried),
         status=failure.status,
-        message=failure.message,
+        remarks=(failure.remark,),
         skipped={"no_screen": 1} if failure.status == "no_screen" else {},
         estimated=failure.estimated or result.estimated,
     )

@@ -46,12 +46,3 @@ def as_stored(turned: Frame, result: FrameResult, quarter_turns: int) -> FrameRe
         other_screens=tuple(as_stored(turned, screen, quarter_turns) for screen in result.other_screens),
         quarter_turns=quarter_turns,
     )
-
-
-def remark(quarter_turns: int) -> str:
-    """A sentence on how a frame was turned for reception."""
-    direction = "counter-clockwise" if quarter_turns == 1 else "clockwise"
-    return (
-        f"the picture was turned after it was taken; it was received turned back by 90 degrees {direction}, and "
-        "columns count from the left of the picture so turned"
-    )

@@ -20,10 +20,9 @@ from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.rows import find_rows
 from rxcli.receiver.screen.strips import PictureStrips, read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
-from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
+from rxcli.types import Float32Array, FloatArray, Lens, LightPlane, Remark
 
 #: The next step where a picture is too dark.
-BRIGHTEN = "expose longer, raise ISO, or show a brighter picture on the screen"
 #: Minimum width and height of a picture, pixels, its maximum height in widths, beyond which a grid in perspective may
 #: have columns of no width, and minimum number of strips across it.
 MIN_SIZE_PX, MAX_TALL, _MIN_STRIPS = 96, 6, 120
@@ -134,28 +133,26 @@ def _screens_apart(strips: PictureStrips, layouts: Sequence[ColumnLayout]) -> li
     return [_numbered(side, grid, layouts) for side, grid in clearest_first]
 
 
-def size_refused(width: int, height: int) -> tuple[str, str] | None:
-    """Why a picture of a size can show no screen and the next step, or None."""
-    size = f"the picture has {width} x {height} pixels"
+def size_refused(width: int, height: int) -> Remark | None:
+    """Why a picture of a size can show no screen, or None."""
     if min(width, height) < MIN_SIZE_PX:
-        step = "use the picture in its full size, not a thumbnail or a messenger's copy"
-        return f"{size}, a screen needs at least {MIN_SIZE_PX} each way", step
+        return Remark("few_pixels", {"width": width, "height": height, "least": MIN_SIZE_PX})
     if height > MAX_TALL * width:
-        return f"{size}, more than {MAX_TALL} times as high as wide", "crop it to the screen"
+        return Remark("too_tall", {"width": width, "height": height, "most": MAX_TALL})
     return None
 
 
-def why_useless(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white: float) -> tuple[str, str] | None:
-    """Why a picture cannot show a screen at all and the next step, or None."""
+def why_useless(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white: float) -> Remark | None:
+    """Why a picture cannot show a screen at all, or None."""
     height, width = pixels.shape
     refused = size_refused(width, height)
     if refused is not None:
         return refused
     sample = thinned(pixels, black, white)
     if np.mean(sample >= 0.004) < 0.005:
-        return "the picture is black", BRIGHTEN
+        return Remark("black")
     if np.mean(sample > 0.98) > 0.99:
-        return "the picture is saturated", "expose shorter, or lower ISO"
+        return Remark("saturated")
     return None
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from math import inf, log
+from typing import Any
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.frame.cache import FrameCache
@@ -11,19 +12,11 @@ from rxcli.receiver.frame.result import Failure, Received, failed, is_received
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.plane import orientation
 from rxcli.receiver.search.cameras import known_camera
-from rxcli.receiver.search.outlines import ON_ITS_SIDE, lean_on_its_side, unreadable_orientation
-from rxcli.receiver.search.refusal import STEADY_LIGHT, likeliest_reason
+from rxcli.receiver.search.outlines import lean_on_its_side, unreadable_orientation
+from rxcli.receiver.search.refusal import likeliest_reason
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.types import Frame, FrameResult
+from rxcli.types import Frame, FrameResult, Reason, Remark
 
-_UPSIDE_DOWN = (
-    "the rows run against the readout, as in a picture that was turned upside down or mirrored after it was taken; "
-    "columns count from the left of the stored picture"
-)
-_AS_STORED = (
-    "the file asks to be turned by 90 degrees, but the columns stand upright in the stored picture; they are counted "
-    "from its left"
-)
 #: Relative difference of line delays up to which an estimate agrees with a profile, and confidence of a sure packet.
 _SAME_LINE_DELAY, _SURE = 0.01, SETTINGS.sure_certainty
 #: Packets of a long exposure that show that it was stated rightly.
@@ -38,13 +31,13 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
     upright = cache.with_metadata(replace(frame.metadata, orientation=1)) if asks_for_turn else cache
     received = _receive_stated(upright, options, receive)
     if received.n_believable:
-        remark = _UPSIDE_DOWN if _is_reversed(received.result) else _AS_STORED if asks_for_turn else None
-        return received.with_remark(remark)
-    if options.corners is not None or received.result.message == STEADY_LIGHT:
+        reason: Reason = "upside_down" if _is_reversed(received.result) else "as_stored"
+        return received.with_remark(Remark(reason) if reason == "upside_down" or asks_for_turn else None)
+    if options.corners is not None or received.result.reason == "steady_light":
         return received
     lean = lean_on_its_side(upright, options)
     if not lean:
-        return received.with_message(likeliest_reason(frame, received.result, options))
+        return received.with_remarks(*likeliest_reason(frame, received.result, options))
     attempts = []
     for quarter_turns in orientation.QUARTER_TURNS if lean < 0 else ():
         back = orientation.turned_frame(frame, quarter_turns)
@@ -55,8 +48,8 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
             attempts.append((rank, attempt._replace(result=result)))
     if attempts:
         (*_, quarter_turns), best = max(attempts, key=lambda attempt: attempt[0])
-        return best.with_remark(orientation.remark(quarter_turns))
-    failure = unreadable_orientation(frame) or Failure("no_screen", f"no screen found: {ON_ITS_SIDE}")
+        return best.with_remark(Remark("turned_counterclockwise" if quarter_turns == 1 else "turned_clockwise"))
+    failure = unreadable_orientation(frame) or Failure(Remark("on_its_side"), "no_screen")
     return Received(failed(FrameResult(frame.source, frame.index, frame.time_s, "ok"), failure), {})
 
 
@@ -73,8 +66,8 @@ def _receive_stated(cache: FrameCache, options: ReceiverOptions, receive: _Recei
         received = receive(attempt, estimating, evidence)
         # One packet is no evidence that what was stated is wrong.
         if received.n_believable > max(best.n_believable, 1) and _is_credible(received.result, cache.frame, options):
-            message = _difference(cache.frame, options, stated, received, is_exposure=attempt is not cache)
-            best = received.with_remark(message)
+            remark = _difference(cache.frame, options, stated, received, is_exposure=attempt is not cache)
+            best = received.with_remark(remark)
     return best
 
 
@@ -132,8 +125,8 @@ def _is_exposure_of_another(estimated: FrameResult, frame: Frame, options: Recei
 
 def _difference(
     frame: Frame, options: ReceiverOptions, stated: Received, estimated: Received, *, is_exposure: bool
-) -> str:
-    """Message of a result with an estimated camera: what was stated, and what was estimated.
+) -> Remark:
+    """Remark on a result with an estimated camera: what was stated, and what was estimated.
 
     Args:
         frame: the picture.
@@ -142,18 +135,12 @@ def _difference(
         estimated: result with the estimate.
         is_exposure: whether the exposure was estimated as well.
     """
-    known, exposure_s = known_camera(frame, options), frame.metadata.exposure_s if is_exposure else None
+    known, found = known_camera(frame, options), estimated.result
     if isinstance(known, Failure):
-        return known.message
-    before, after, check = [], [], "check what wrote the file's exposure"
-    if known is not None:
-        before.append(f"camera profile {known.profile} ({1e6 * known.line_delay_s:.3f} us a row)")
-        after.append(f"{1e6 * (estimated.result.line_delay_s or 0.0):.3f} us a row")
-        check = f"leave out or replace that profile, or {check}" if exposure_s else "leave out or replace that profile"
-    if exposure_s is not None:
-        before.append(f"the stated exposure ({1e6 * exposure_s:.0f} us)")
-        after.append(f"an exposure of {1e6 * (estimated.result.exposure_s or 0.0):.0f} us")
-    return (
-        f"{' and '.join(before)} gave {stated.n_believable} packets, an estimate ({', '.join(after)}) "
-        f"{estimated.n_believable}, which are reported; {check}"
-    )
+        return known.remark
+    facts: dict[str, Any] = {"n_stated": stated.n_believable, "n_estimated": estimated.n_believable}
+    facts |= {"stated_s": frame.metadata.exposure_s or 0.0, "exposure_s": found.exposure_s or 0.0}
+    if known is None:
+        return Remark("other_exposure", facts)
+    facts |= {"profile": known.profile, "profile_s": known.line_delay_s, "line_delay_s": found.line_delay_s or 0.0}
+    return Remark("other_camera_and_exposure" if is_exposure else "other_camera", facts)

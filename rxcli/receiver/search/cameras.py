@@ -26,7 +26,7 @@ from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.types import Clock, Float32Array, FloatArray, Frame, Lens, RowProfiles
+from rxcli.types import Clock, Float32Array, FloatArray, Frame, Lens, Remark, RowProfiles
 
 DEFAULT_TONE = "srgb"
 UNKNOWN = FrameCamera(None, float("nan"), float("nan"), None, DEFAULT_TONE)
@@ -44,11 +44,8 @@ def known_camera(frame: Frame, options: ReceiverOptions) -> FrameCamera | Failur
         return None
     mode = profile.mode_for(frame.width, frame.height)
     if mode is None:
-        return Failure(
-            "no_signal",
-            f"camera profile {profile.name} has no readout mode for {frame.width} x {frame.height}; add one with "
-            "vlc-rx calibrate shutter, or leave the camera to be estimated with --camera auto",
-        )
+        facts = {"profile": profile.name, "width": frame.width, "height": frame.height}
+        return Failure(Remark("no_readout_mode", facts))
     lens = geometry.lens_for(profile.lens, frame.width, frame.height) if profile.lens else None
     tone = DEFAULT_TONE if profile.tone == "auto" else profile.tone
     exposure_s = meta.exposure_s or mode.exposure_s or 5 * mode.line_delay_s
@@ -63,7 +60,7 @@ def known_lens(frame: Frame, options: ReceiverOptions) -> Lens | None:
 
 def propose_cameras(
     cache: FrameCache, corners: FloatArray, options: ReceiverOptions, n_columns: int, *, may_bend: bool = True
-) -> Generator[FrameCamera, None, Failure]:
+) -> Generator[FrameCamera, None, Remark]:
     """Propose cameras of a frame, likeliest first; returns the reason if there are no others.
 
     Args:
@@ -86,7 +83,7 @@ def propose_cameras(
     ranked = sorted(hypotheses, key=lambda hypothesis: hypothesis.number)
     cameras = [estimated_camera(hypothesis, rates[hypothesis.packet_slots], frame) for hypothesis in ranked]
     yield from [camera for camera in cameras if has_stated_readout(camera, frame)] or cameras
-    return Failure("no_signal", why_not(strips))
+    return why_not(strips)
 
 
 def has_stated_readout(camera: FrameCamera, frame: Frame) -> bool:

@@ -6,7 +6,6 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.decode.assemble import further_pictures
 from rxcli.receiver.frame.cache import FrameCache, key_of
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
@@ -18,25 +17,13 @@ from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.stripes import MIN_LEAN, stripe_lean
 from rxcli.receiver.search.cameras import known_lens
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.types import FloatArray, Frame
+from rxcli.types import FloatArray, Frame, Remark
 
-_TOO_SLOW = (
-    "the screen may have no profile here (vlc-rx profiles lists them); else use a faster slot rate or shorter packets"
-)
 #: Log-odds of the bright part of a picture against columns that were found.
 _BRIGHT_LOG_ODDS = -50.0
 #: Natural logarithm of the ratio of aspects up to which a bright part may be the screen, and its probability beyond: of
 #: 39 bright parts of dark pictures none had the screen's aspect, and films alone, one in three, its width.
 _SAME_ASPECT, _FILM_CERTAINTY = 0.08, 0.3
-ON_ITS_SIDE = (
-    "if the picture shows a screen that sends, its columns lie along the rows, as in portrait or where a picture was "
-    "turned after it was taken; use the camera's own file, taken in landscape"
-)
-NO_COLUMNS = "no columns of a modulated backlight were found in the picture"
-_SHOW_COLUMNS = (
-    "photograph a screen that sends, from near, with the electronic shutter and a short exposure (1/8000 s), and use "
-    "the picture in its full size"
-)
 
 
 def proposed_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[Outline]] | Failure:
@@ -85,10 +72,8 @@ def _viewed(outline: Outline, frame: Frame) -> Outline:
 
 def no_screen(cache: FrameCache, options: ReceiverOptions) -> Failure:
     """Failure of a picture without a screen."""
-    reason = ON_ITS_SIDE if lean_on_its_side(cache, options) else reason_for_none(cache.frame)
-    if _bright(cache) is not None:
-        reason += "; if the bright part is the screen, it is lit without slots"
-    return Failure("no_screen", f"no screen found: {reason}")
+    reason = Remark("on_its_side") if lean_on_its_side(cache, options) else reason_for_none(cache)
+    return Failure(reason, "no_screen")
 
 
 def _given(corners: FloatArray, cache: FrameCache, options: ReceiverOptions) -> Outline:
@@ -143,35 +128,26 @@ def unreadable_orientation(frame: Frame) -> Failure | None:
     orientation = frame.metadata.orientation
     if orientation not in PORTRAIT:
         return None
-    return Failure(
-        "no_signal",
-        f"the picture was taken in portrait (EXIF orientation {orientation}): the sensor reads along the width of "
-        "the columns, which then cannot be separated; hold the camera in landscape",
-    )
+    return Failure(Remark("portrait", {"orientation": orientation}))
 
 
 def outside_the_picture(corners: FloatArray, frame: Frame) -> Failure | None:
     """Failure of a given outline that shows too little of the screen, or None."""
     import cv2
 
-    size = f"{frame.width} x {frame.height} pixels"
-    hint = "give them in stored pixels, from 0,0 at its top left"
+    size = {"width": frame.width, "height": frame.height}
     if (np.ptp(corners, axis=0) > SETTINGS.largest_outline * np.array([frame.width, frame.height])).any():
-        return Failure(
-            "no_screen", f"the corners that were given lie far outside the picture, which has {size}; {hint}"
-        )
+        return Failure(Remark("corners_far", size), "no_screen")
     right, bottom = frame.width - 0.5, frame.height - 0.5
     picture = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]], np.float32)
     outline = np.asarray(corners, np.float32)
     shared, part = cv2.intersectConvexConvex(outline, picture)
     if shared <= max(SETTINGS.min_overlap * min(cv2.contourArea(outline), frame.width * frame.height), 1.0):
-        return Failure("no_screen", f"the corners that were given lie outside the picture, which has {size}; {hint}")
+        return Failure(Remark("corners_outside", size), "no_screen")
     n_rows = int(np.ptp(np.asarray(part)[..., 1]))
     if n_rows < SETTINGS.min_rows:
-        reason = (
-            f"the corners that were given leave {n_rows} rows of the picture, and {SETTINGS.min_rows} are the least"
-        )
-        return Failure("no_screen", f"{reason}; {hint}")
+        facts = {"n_rows": n_rows, "min_rows": SETTINGS.min_rows}
+        return Failure(Remark("corners_few_rows", facts), "no_screen")
     return None
 
 
@@ -212,26 +188,25 @@ def _lean(cache: FrameCache, layouts: list[find.ColumnLayout], upright: float) -
     return lean if lying and lying[0].stands_out and lying[0].contrast >= upright else 0.0
 
 
-def reason_for_none(frame: Frame) -> str:
-    """Why no screen was found in a frame, and what to do."""
+def reason_for_none(cache: FrameCache) -> Remark:
+    """Why no screen was found in a frame."""
+    frame = cache.frame
     levels = frame.mosaic
     black, white = (frame.black, frame.white) if levels is None else (float(np.mean(levels.black)), levels.white)
     useless = find.why_useless(frame.pixels, black, white)
     mean = float(find.thinned(frame.pixels, black, white).mean())
     if useless is None and mean < SETTINGS.dark_mean:
-        return f"{NO_COLUMNS}, and it is dark ({max(100 * mean, 0):.0f} % of white on average); {find.BRIGHTEN}"
-    return "; ".join(useless or (NO_COLUMNS, _SHOW_COLUMNS))
+        return Remark("no_columns_dark", {"mean_percent": 100 * max(mean, 0.0)})
+    return useless or Remark("no_columns" if _bright(cache) is None else "lit")
 
 
-def too_small(context: FrameContext, screen: ScreenProfile) -> str | None:
-    """Message if no packet of `screen` fits the rows that show it, or None."""
+def too_small(context: FrameContext, screen: ScreenProfile) -> Remark | None:
+    """Remark if no packet of `screen` fits the rows that show it, or None."""
     frame, camera = context.frame, context.camera
     fill = float(np.ptp(np.clip(context.sampled_corners[:, 1], 0, frame.height - 1))) / frame.height
     needed = screen.packet_s / (camera.line_delay_s * frame.height)
     if fill >= needed:
         return None
-    advice = "move closer" if needed < 1 else f"{further_pictures(fill / needed)}; {_TOO_SLOW}"
-    return (
-        f"the screen fills {np.floor(100 * fill):.0f} % of the height: one packet at {screen.slot_rate_hz / 1e3:g} kHz "
-        f"needs {np.ceil(100 * needed):.0f} % with this camera; {advice}"
-    )
+    facts = {"fill_percent": np.floor(100 * fill), "needed_percent": np.ceil(100 * needed), "share": fill / needed}
+    facts["slot_rate_hz"] = screen.slot_rate_hz
+    return Remark("screen_fills_little" if needed < 1 else "packet_too_long", facts)

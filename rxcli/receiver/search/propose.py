@@ -25,7 +25,7 @@ from rxcli.receiver.search.evidence import USUAL_COLUMNS
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import Clock, RowProfiles
+from rxcli.types import Clock, Remark, RowProfiles
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,18 +54,18 @@ class Proposer:
         chosen = [likeliest_of_family(outlines) for outlines in families.values()]
         return sorted(chosen, key=lambda outline: (-outline.log_odds, outline.family))
 
-    def cameras(self) -> Generator[list[Hypothesis], None, Failure | None]:
+    def cameras(self) -> Generator[list[Hypothesis], None, Remark | None]:
         """Hypotheses camera by camera, the likeliest camera first; returns the reason why there are none, or no more.
 
         Rows are the same instants wherever the columns are, so the first family with any camera serves for all.
         """
         known = self.known.camera if self.known else known_camera(self.cache.frame, self.options)
         if isinstance(known, Failure):
-            return known
+            return known.remark
         if known is not None:
             yield self._of_camera(known, 0.0)
             return None
-        failure, n_proposed = None, 0
+        reason, n_proposed = None, 0
         usual = nearest_screen(self.options.screens, USUAL_COLUMNS).columns
         for outline in self.families():
             cameras = propose_cameras(self.cache, outline.corners, self.options, usual, may_bend=self.may_bend)
@@ -75,10 +75,10 @@ class Proposer:
                         yield hypotheses
                         n_proposed += 1
             except StopIteration as end:
-                failure = failure or end.value
+                reason = reason or end.value
             if n_proposed:
                 break
-        return failure
+        return reason
 
     def _of_camera(self, camera: FrameCamera, log_prior: float) -> list[Hypothesis]:
         """Hypotheses of one camera: a screen for every outline and clock."""

@@ -25,12 +25,12 @@ from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
 from rxcli.receiver.search.numbers import less_likely_outlines, numbered
 from rxcli.receiver.search.outlines import proposed_screens, without_borders
 from rxcli.receiver.search.propose import Proposer
-from rxcli.receiver.search.refusal import STEADY_LIGHT, light_without_data, why_no_packets
+from rxcli.receiver.search.refusal import light_without_data, why_no_packets
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import in_other_bursts, initial_pass
-from rxcli.types import FloatArray
+from rxcli.types import FloatArray, Remark
 
-_Cameras = Generator[list[Hypothesis], None, Failure | None]
+_Cameras = Generator[list[Hypothesis], None, Remark | None]
 #: Negative key, so that a heap returns the likeliest first; identity and a number order ties.
 _Entry = tuple[float, tuple[object, ...], int, Hypothesis]
 
@@ -73,7 +73,7 @@ def search(
         # Of one column that sends alone, its own rows give the camera, and the corners its number.
         numbered_by_corners = _search(cache, options, borderless.best.context, outlines, may_bend, least)
         return numbered_by_corners if _packet_evidence(numbered_by_corners) else found
-    is_steady = isinstance(borderless, Failure) and borderless.message == STEADY_LIGHT and not packets
+    is_steady = isinstance(borderless, Failure) and borderless.reason == "steady_light" and not packets
     return borderless if is_steady or _packet_evidence(borderless) > SETTINGS.borderless_gain * packets else found
 
 
@@ -103,7 +103,7 @@ def _search(
     if best is None or best.evidence < min_evidence:
         best = walk.best_without_packets()
     if best is None:
-        return replace(why_no_packets(proposer, walk.nearest, walk.failure), tried=walk.record(None))
+        return replace(why_no_packets(proposer, walk.nearest, walk.reason), tried=walk.record(None))
     if best.evidence >= SETTINGS.few_packets:
         outlines = less_likely_outlines(best, outlines, proposer)
     chosen = numbered(best.hypothesis.outline, outlines, walk.score_of)
@@ -146,7 +146,7 @@ class _Walk:
         self._cameras: _Cameras | None = proposer.cameras()
         self._next_prior = np.inf
         #: Reason why there are no cameras; and the first hypothesis.
-        self.failure: Failure | None = None
+        self.reason: Remark | None = None
         self.nearest: Hypothesis | None = None
 
     def run(self) -> Scored | None:
@@ -229,7 +229,7 @@ class _Walk:
             try:
                 proposed = next(self._cameras)
             except StopIteration as end:
-                self._cameras, self.failure = None, end.value
+                self._cameras, self.reason = None, end.value
                 break
             if not proposed:
                 continue

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rxcli.protocol import bits_per_symbol, bits_to_hex, indices_to_bits
 from rxcli.receiver.decode import assemble, confidence
+from rxcli.results.reasons import sentence_of
 from rxcli.types import BurstPosteriors, Clock, ColumnResult, PacketResult, SlotSamples
 
 N_SYMBOLS, PACKET, Q = 3, 50, 4
@@ -80,7 +81,7 @@ def test_a_sure_packet() -> None:
     assert [c.w for c in columns] == w
     assert [c.snr_db for c in columns] == pytest.approx([20.0, 20.0])
     assert [c.delay_slots for c in columns] == [0.0, 1.5]
-    assert [c.message for c in columns] == [None, None]
+    assert [c.reason for c in columns] == [None, None]
     for column, result in enumerate(columns):
         (packet,) = result.packets
         assert packet.payload_bits == N_SYMBOLS * bits_per_symbol(w[column])
@@ -207,7 +208,7 @@ def test_a_header_that_is_contradicted_stands_for_no_packet() -> None:
     assert not first.packets
     assert first.w is None
     assert first.status == "no_packet"
-    assert "header" in first.message
+    assert first.reason == "headerless"
     assert second.packets
 
 
@@ -217,14 +218,15 @@ def test_nothing_decoded_says_why() -> None:
     light = np.stack([snr(120)[0], snr(120, 0.01)[0]])
     bright, dark = results_of(clock, unsure, light, samples, 0)
     assert (bright.status, dark.status) == ("no_packet", "dark")
-    assert "20.0 dB" in bright.message
-    assert "too little light" in dark.message
+    assert "20.0 dB" in sentence_of(bright.remark)
+    assert dark.reason == "dark"
     short = clock_of(30, 0, [0])
     (few, _) = results_of(short, unsure, snr(30), samples_of(30), 0)
-    assert "of 50 slots 20 are missing; a picture shows 60 % of a packet: send 2 more photos, or film" in few.message
+    expected = "of 50 slots 20 are missing; a picture shows 60 % of a packet: send 2 more photos, or film"
+    assert expected in sentence_of(few.remark)
     for column in (bright, dark, few):
-        assert "\n" not in (column.message or "")
-        assert "; " in (column.message or "")
+        assert "\n" not in sentence_of(column.remark)
+        assert "; " in sentence_of(column.remark)
 
 
 def test_a_column_never_seen_is_dark() -> None:
@@ -277,7 +279,7 @@ def test_a_column_that_shows_its_neighbour_has_no_packet(
     snr[quieter] = 30.0
     results = results_of(clock, posteriors_of(w, index), snr, samples_of(clock.n_slots, 4), 0.0)
     assert [c.column for c in results if not c.packets] == expected
-    assert all("the column beside it" in (results[column].message or "") for column in expected)
+    assert all(results[column].reason == "echo" for column in expected)
 
 
 def test_a_packet_may_miss_two_slots_of_a_symbol_but_not_three() -> None:
@@ -298,7 +300,7 @@ def test_a_packet_of_a_clip_that_misses_a_slot_is_not_whole() -> None:
         assemble.FrameColumns(clock, snr(60), np.zeros(2, bool), 0.0), [burst], lambda _: False
     )
     assert not first.packets
-    assert "of 50 slots 1 are missing" in (first.message or "")
+    assert (first.reason, first.remark.facts["missing"]) == ("incomplete", 1)
     assert second.packets
 
 

@@ -13,7 +13,6 @@ from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver import receive
 from rxcli.receiver.camera import CameraHypothesis
-from rxcli.receiver.camera.advice import NO_HEADERS
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.camera import FrameCamera
@@ -25,7 +24,8 @@ from rxcli.receiver.search import cut
 from rxcli.receiver.search.cameras import estimated_camera, relabelled_camera
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
-from rxcli.types import Clock, Frame, FrameResult, FrameSoftBits, Metadata, RowProfiles, SearchStep
+from rxcli.results.reasons import sentence_of
+from rxcli.types import Clock, Frame, FrameResult, FrameSoftBits, Metadata, Remark, RowProfiles, SearchStep
 
 SCREEN = load_profile("data-17k3", ScreenProfile)
 
@@ -67,11 +67,11 @@ def test_the_message_names_the_share_of_a_packet_in_view() -> None:
     llr = np.zeros((2, 11, 20, 7), np.float32)
     llr[0, :3, 5], llr[1, 2:4, 6] = 3.0, -2.0
     soft = FrameSoftBits(np.arange(2), llr)
-    message = receive._with_part_in_view(f"a note; {NO_HEADERS}", soft)
-    assert message == (
-        "a note; less than a packet is in view: a picture shows 36 % of a packet: send 3 more photos, or film"
-    )
-    assert receive._with_part_in_view(NO_HEADERS, None) == NO_HEADERS
+    remarks = (Remark("unsure"), Remark("no_headers"))
+    kept, part = receive._with_part_in_view(remarks, soft)
+    assert kept == remarks[0]
+    assert "36 % of a packet: send 3 more photos, or film" in sentence_of(part)
+    assert receive._with_part_in_view(remarks, None) == remarks
 
 
 def seen(monkeypatch: pytest.MonkeyPatch, by_outline: list[RowProfiles]) -> list[FrameContext]:

@@ -302,7 +302,7 @@ def test_a_stated_readout_shows_the_slot_rate(
     )
     monkeypatch.setattr(cameras, "propose", lambda *_, **__: list(ways))
     monkeypatch.setattr(cameras, "_strips", lambda *_: None)
-    monkeypatch.setattr(cameras, "why_not", lambda *_: "")
+    monkeypatch.setattr(cameras, "why_not", lambda *_: None)
     monkeypatch.setattr(FrameContext, "sample_columns", lambda *_: None)
     options = ReceiverOptions(screens=tuple(screen for screen in SHIPPED if screen.columns == 20))
     proposed = list(cameras.propose_cameras(FrameCache(frame), np.zeros((4, 2)), options, 20))
