@@ -28,6 +28,8 @@ DEVICE = Path("/dev/video0")
 BUFFER_BYTES, MAX_BUFFERS = 8 << 20, 8
 #: Name -> bits per pixel of the frame in memory, bytes per pixel in a row of its first plane; MJPG is compressed.
 FORMATS = {"GREY": (8, 1), **dict.fromkeys(("Y10 ", "Y12 ", "Y16 ", "YUYV"), (16, 2)), "NV12": (12, 1), "MJPG": (16, 0)}
+#: Further ones: with chroma in the other order or in planes of its own, of which two are in buffers of their own.
+OTHERS = {**dict.fromkeys(("NV21", "YU12", "YV12", "NM12", "YM12"), (12, 1)), "YVYU": (16, 2), "JPEG": (16, 0)}
 _SHIFTS = {"Y10 ": 2, "Y12 ": 4, "Y16 ": 8}
 #: Controls: id -> type, name, least and greatest value, and value at first.
 _CONTROLS = {
@@ -37,7 +39,11 @@ _CONTROLS = {
     0x00980913: (1, b"Gain", 0, 255, 16),
     0x00980912: (2, b"Gain, Automatic", 0, 1, 1),
 }
-_CAPABILITIES = 0x04200001  # streaming, extended pixel format, video capture
+#: Of a sensor on a board: exposure in lines, gain; blank pixels in a line, and pixels a second, which are only read.
+_BOARD_CONTROLS = {0x00980911: (1, b"Exposure", 4, 1000, 600), 0x009E0903: (1, b"Analogue Gain", 0, 978, 16)}
+_BLANK, _PIXEL_RATE = 0x009E0902, 0x009F0902
+_CAPABILITIES = 0x04200000  # streaming, extended pixel format
+_CAPTURE, _PLANES = {1: 0x1, 9: 0x1000}, 9  # capability by type of buffers
 _TIMESTAMP_MONOTONIC, _BUFFER_ERROR = 0x2000, 0x40
 _NEVER = 1 << 60
 
@@ -59,7 +65,10 @@ class FakeCamera:
             frames the camera is gone, and comes back after `return_s`; `stall_after`: no more come; `damage_every`,
             `short_every`: one of so many is damaged, or has half of its bytes; `force_format`: what S_FMT answers;
             `stamp_pace`: time stamps run so many times as fast as time; `stream_error`: of STREAMON;
-            `interrupt_after`: the user presses Ctrl-C.
+            `interrupt_after`: the user presses Ctrl-C; `start_s`: the first frame comes so late; `sizes`: "none" are
+            listed, or a "range" of them; `planes`: buffers are in several; `reset`: STREAMON forgets the controls;
+            `board`: controls of a sensor on a board, with pixels a second where it is a number; `fail_every`: one of so
+            many calls fails with EIO.
     """
 
     def __init__(
@@ -74,7 +83,9 @@ class FakeCamera:
         self.height, self.width = luma.shape[1:]
         self.faults = dict.fromkeys(("unplug_after", "stall_after", "damage_every", "short_every"), _NEVER)
         self.faults |= {"interrupt_after": _NEVER, **(faults or {})}
-        self.controls = {control: value for control, (*_, value) in _CONTROLS.items()}
+        self.offered = _BOARD_CONTROLS if "board" in self.faults else _CONTROLS
+        self.controls = {control: value for control, (*_, value) in self.offered.items()}
+        self.kind, self.n_calls, self.size = _PLANES if "planes" in self.faults else 1, 0, (self.width, self.height)
         self.format, self.queue = formats[0], list[int]()
         self.n_buffers = self.n_frames = 0
         self.sequence, self.started_s = -1, 0.0
@@ -84,7 +95,9 @@ class FakeCamera:
         self._handlers = {
             0x80685600: self._query_capabilities,
             0xC0405602: self._enumerate_formats,
+            0xC0D05604: self._get_format,
             0xC0D05605: self._set_format,
+            0xC0205647: self._get_long_controls,
             0xC0145608: self._request_buffers,
             0xC0585609: lambda a: self._describe(a, self._index(a)),
             0xC058560F: self._queue_buffer,
@@ -100,7 +113,8 @@ class FakeCamera:
 
     def ioctl(self, _descriptor: int, request: int, argument: Any) -> None:
         """Answer one call, whose argument is changed in place."""
-        data, request = bytearray(argument), request & 0xFFFFFFFF
+        data, request, self.n_calls = bytearray(argument), request & 0xFFFFFFFF, self.n_calls + 1
+        _fail_unless(bool(self.n_calls % self.faults.get("fail_every", _NEVER)), errno.EIO)
         _fail_unless(request in self._handlers, errno.ENOTTY)
         if self.gone_s is not None:
             _fail_unless(time.monotonic() - self.gone_s > self.faults.get("return_s", _NEVER), errno.ENODEV)
@@ -112,45 +126,67 @@ class FakeCamera:
 
     def _query_capabilities(self, a: bytearray) -> None:
         names = (b"fakev4l2", b"Fake camera", b"platform:fake")
-        struct.pack_into("<16s32s32sIII", a, 0, *names, 0x060100, _CAPABILITIES | 0x80000000, _CAPABILITIES)
+        able = _CAPABILITIES | _CAPTURE[self.kind]
+        struct.pack_into("<16s32s32sIII", a, 0, *names, 0x060100, able | 0x80000000, able)
 
     def _limits(self, a: bytearray) -> tuple[Any, ...]:
         (control,) = struct.unpack_from("<I", a)
-        _fail_unless(control in _CONTROLS)
-        return (control, *_CONTROLS[control][:4])
+        _fail_unless(control in self.offered)
+        return (control, *self.offered[control][:4])
 
     def _set_control(self, a: bytearray) -> None:
         (control, _, _, low, high), (value,) = self._limits(a), struct.unpack_from("<i", a, 4)
         _fail_unless(low <= value <= high, errno.ERANGE)
         self.controls[control] = value
 
+    def _get_long_controls(self, a: bytearray) -> None:
+        (count,), (place,) = struct.unpack_from("<I", a, 4), struct.unpack_from("<Q", a, 24)
+        known = {_BLANK: 32, _PIXEL_RATE: self.faults.get("board")}
+        for entry in (memoryview((ctypes.c_ubyte * 20).from_address(place + 20 * i)).cast("B") for i in range(count)):
+            value = known.get(struct.unpack_from("<I", entry)[0])
+            _fail_unless(isinstance(value, int))
+            struct.pack_into("<q", entry, 12, value)
+
     def _enumerate_formats(self, a: bytearray) -> None:
         index, kind = struct.unpack_from("<II", a)
-        _fail_unless(kind == 1 and index < len(self.formats))
+        _fail_unless(kind == self.kind and index < len(self.formats))
         name = self.formats[index].encode()
         struct.pack_into("<I32sI", a, 8, name == b"MJPG", name, int.from_bytes(name, "little"))
 
     def _enumerate_sizes(self, a: bytearray) -> None:
         index, code = struct.unpack_from("<II", a)
         _fail_unless(not index and code.to_bytes(4, "little").decode() in self.formats)
-        struct.pack_into("<III", a, 8, 1, self.width, self.height)
+        _fail_unless(self.faults.get("sizes") != "none", errno.ENOTTY)
+        if "sizes" in self.faults:
+            struct.pack_into("<I6I", a, 8, 3, 32, self.width, 2, 32, self.height, 2)
+        else:
+            struct.pack_into("<III", a, 8, 1, self.width, self.height)
 
     def _enumerate_intervals(self, a: bytearray) -> None:
         _fail_unless(not struct.unpack_from("<I", a)[0])
         struct.pack_into("<III", a, 16, 1, 1000, round(self.fps * 1000))
 
     def _frame_bytes(self) -> int:
-        return self.width * self.height * FORMATS[self.format][0] // 8
+        return self.size[0] * self.size[1] * (FORMATS | OTHERS)[self.format][0] // 8
 
     def _set_format(self, a: bytearray) -> None:
-        _fail_unless(struct.unpack_from("<I", a)[0] == 1)
+        _fail_unless(struct.unpack_from("<I", a)[0] == self.kind)
         self.asked_s = self.asked_s or time.monotonic()
         _fail_unless(time.monotonic() - self.asked_s >= self.faults.get("busy_s", 0.0), errno.EBUSY)
-        asked = struct.unpack_from("<I", a, 16)[0].to_bytes(4, "little").decode("latin-1")
-        asked = self.faults.get("force_format", asked)
+        width, height, asked = struct.unpack_from("<II4s", a, 8)
+        asked = self.faults.get("force_format", asked.decode("latin-1"))
         self.format = asked if asked in self.formats else self.format
-        code, pitch = int.from_bytes(self.format.encode(), "little"), self.width * FORMATS[self.format][1]
-        struct.pack_into("<8I", a, 8, self.width, self.height, code, 1, pitch, self._frame_bytes(), 8, 0)
+        if "sizes" in self.faults:
+            self.size = min(width, self.width) // 2 * 2, min(height, self.height) // 2 * 2
+        self._get_format(a)
+
+    def _get_format(self, a: bytearray) -> None:
+        code, pitch = int.from_bytes(self.format.encode(), "little"), self.size[0] * (FORMATS | OTHERS)[self.format][1]
+        if self.kind == _PLANES:
+            struct.pack_into("<5III", a, 8, *self.size, code, 1, 8, self._frame_bytes(), pitch)
+            struct.pack_into("<B", a, 8 + 20 + 8 * 20, 1)
+        else:
+            struct.pack_into("<8I", a, 8, *self.size, code, 1, pitch, self._frame_bytes(), 8, 0)
 
     # -- streaming ----------------------------------------------------------------------------------------------------
 
@@ -161,9 +197,15 @@ class FakeCamera:
         struct.pack_into("<I", a, 0, self.n_buffers)
 
     def _describe(self, a: bytearray, index: int, used: int = 0, flags: int = 0, time_s: float = 0.0) -> None:
-        struct.pack_into("<IIIII", a, 0, index, 1, used, flags | 1 | _TIMESTAMP_MONOTONIC, 1)
+        place, length = index * BUFFER_BYTES, self._frame_bytes()
+        if self.kind == _PLANES:
+            at, n_planes = struct.unpack_from("<QI", a, 64)
+            plane = memoryview((ctypes.c_ubyte * (64 * n_planes)).from_address(at)).cast("B")
+            struct.pack_into("<IIQ", plane, 0, used, length, place)
+            used, place, length = 0, at, 1
+        struct.pack_into("<IIIII", a, 0, index, self.kind, used, flags | 1 | _TIMESTAMP_MONOTONIC, 1)
         struct.pack_into("<qq", a, 24, int(time_s), int(time_s % 1 * 1e6))
-        struct.pack_into("<IIQI", a, 56, max(0, self.sequence), 1, index * BUFFER_BYTES, self._frame_bytes())
+        struct.pack_into("<IIQI", a, 56, max(0, self.sequence), 1, place, length)
 
     def _index(self, a: bytearray) -> int:
         (index,) = struct.unpack_from("<I", a)
@@ -182,12 +224,15 @@ class FakeCamera:
             _fail_unless(False, errno.ENODEV)
         if self.n_frames >= self.faults["interrupt_after"]:
             signal.raise_signal(signal.SIGINT)
-        is_early = time.monotonic() < self.started_s + (self.sequence + 1) / self.fps
+        is_early = time.monotonic() < self.started_s + max(
+            (self.sequence + 1) / self.fps, self.faults.get("start_s", 0)
+        )
         is_stalled = self.n_frames >= self.faults["stall_after"]
         _fail_unless(not (is_stalled or is_early) and bool(self.queue), errno.EAGAIN)
         self.sequence = max(self.sequence + 1, int((time.monotonic() - self.started_s) * self.fps))
         self.n_frames += 1
-        index, picture = self.queue.pop(0), self._picture(self.luma[self.sequence % len(self.luma)])
+        seen = self.luma[self.sequence % len(self.luma), : self.size[1], : self.size[0]]
+        index, picture = self.queue.pop(0), self._picture(seen)
         self.memory[index, : picture.size] = picture
         used = picture.size // (1 if self.n_frames % self.faults["short_every"] else 2)
         flags = 0 if self.n_frames % self.faults["damage_every"] else _BUFFER_ERROR
@@ -197,15 +242,17 @@ class FakeCamera:
     def _stream_on(self, a: bytearray) -> None:
         _fail_unless("stream_error" not in self.faults, self.faults.get("stream_error", 0))
         self.sequence, self.started_s = -1, time.monotonic()
+        if "reset" in self.faults:
+            self.controls = {control: value for control, (*_, value) in self.offered.items()}
 
     def _picture(self, luma: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """A frame in the current pixel format, as it lies in memory."""
-        if self.format == "MJPG":
+        if self.format in ("MJPG", "JPEG"):
             form = {"quality": 100, "colorspace": "GRAY", "colorsubsampling": "Gray"}
             return np.frombuffer(simplejpeg.encode_jpeg(luma[:, :, None].copy(), **form), np.uint8)
-        if self.format == "NV12":
+        if self.format[:2] in ("NV", "NM", "YU", "YV", "YM") and self.format[2:].isdigit():
             return np.append(luma, np.full(luma.size // 2, 0x80, np.uint8))
-        if self.format == "YUYV":
+        if self.format in ("YUYV", "YVYU"):
             return np.stack([luma, np.full_like(luma, 0x80)], axis=-1).ravel()
         return (
             luma.ravel() if self.format == "GREY" else (luma.astype("<u2") << _SHIFTS[self.format]).view("u1").ravel()

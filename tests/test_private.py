@@ -87,7 +87,9 @@ def test_a_decode_writes_its_outputs_and_talks_to_nobody(tmp_path: Path, names: 
     }
 
 
-@pytest.mark.parametrize("name", ["http:/host/x.mp4", "http:x.mp4", "a:b.mp4", "concat:a.mp4", "50%d?x=1#y.mp4", "a%d.jpg"])
+@pytest.mark.parametrize(
+    "name", ["http:/host/x.mp4", "http:x.mp4", "a:b.mp4", "concat:a.mp4", "50%d?x=1#y.mp4", "a%d.jpg"]
+)
 def test_the_name_of_a_clip_is_the_name_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """FFmpeg takes what stands before a colon for a protocol, of the network for instance, and %d for other files."""
     monkeypatch.chdir(tmp_path)

@@ -31,16 +31,22 @@ from rxcli.types import Frame, Metadata
 Luma = NDArray[np.uint8] | NDArray[np.uint16]
 
 _CAPTURE, _MAPPED = api.V4L2_BUF_TYPE_VIDEO_CAPTURE, api.V4L2_MEMORY_MMAP
+#: Buffers in several planes, as those of cameras on phones and boards are, and how many at most.
+_PLANES, _N_PLANES = api.V4L2_BUF_TYPE_VIDEO_CAPTURE_MPLANE, 8
 #: Requests of linux/videodev2.h that the package lacks, whose structures are numbers of 32 bits, and how many.
 _FRAME_SIZES, _N_SIZE, _FRAME_INTERVALS, _N_INTERVAL = 0xC02C564A, 11, 0xC034564B, 13
-#: Unit of the control of the exposure, seconds.
-_EXPOSURE_UNIT_S = 100e-6
+#: Unit of the usual control of the exposure, seconds, and the exposure if none is requested.
+_EXPOSURE_UNIT_S = _SHORT_S = 100e-6
 _N_BUFFERS = 4
 #: Minimum frame rate if none is requested, so that an aimed camera responds at once.
 _USUAL_FPS = 24.0
 _POLL_S = 0.1
 _RETRY_S = 0.5
 _NO_DATA_SLEEP_S = 0.002
+#: Some cameras take seconds to their first frame.
+_START_S = 10.0
+#: Attempts at a call that fails now and then.
+_ATTEMPTS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,16 +62,17 @@ class PixelFormat:
     ycbcr: bool = False
 
 
+_COMPRESSED = ("MJPG", "JPEG")
 #: In the order of preference, at equal size and sufficient rate: more bits first, compressed last.
 PIXEL_FORMATS = {
     "Y16": PixelFormat(np.uint16, white=65535),
     "Y12": PixelFormat(np.uint16, white=4095),
     "Y10": PixelFormat(np.uint16, white=1023),
     "GREY": PixelFormat(),
-    "NV12": PixelFormat(ycbcr=True),
-    "YUYV": PixelFormat(step=2, ycbcr=True),
-    "UYVY": PixelFormat(step=2, start=1, ycbcr=True),
-    "MJPG": PixelFormat(),
+    **dict.fromkeys(("NV12", "NV21", "NV16", "YU12", "YV12", "NM12", "NM21", "YM12"), PixelFormat(ycbcr=True)),
+    **dict.fromkeys(("YUYV", "YVYU"), PixelFormat(step=2, ycbcr=True)),
+    **dict.fromkeys(("UYVY", "VYUY"), PixelFormat(step=2, start=1, ycbcr=True)),
+    **dict.fromkeys(_COMPRESSED, PixelFormat()),
 }
 
 
@@ -195,8 +202,8 @@ class Camera:
                 if buffer is not None:
                     self._give_back(buffer)
                     self.counts.damaged += luma is None
-                elif silent_s > self._settings.stall_s:
-                    reason = f"{self._path}: the camera sent nothing for {self._settings.stall_s:g} s"
+                elif silent_s > (limit_s := self._settings.stall_s if self._sequence is not None else _START_S):
+                    reason = f"{self._path}: the camera sent nothing for {limit_s:g} s"
                     raise CameraLost(reason, "check its cable, or lower size and rate")
                 if luma is not None:
                     yield self._frame(luma, buffer.timestamp.tv_sec + buffer.timestamp.tv_usec * 1e-6)
@@ -206,20 +213,24 @@ class Camera:
     # -- setting up ---------------------------------------------------------------------------------------------------
 
     def _configure(self, opened: ExitStack) -> None:
-        self._card = _check_capture(self._descriptor, self._path)
-        wanted = _choose(list(_modes(self._descriptor)), self._settings, self._path)
-        self._form = _set_format(self._descriptor, wanted, self._path)
-        fps = _set_rate(self._descriptor, self._settings.fps or wanted.fps)
+        self._card, self._kind = _check_capture(self._descriptor, self._path)
+        wanted = _choose(list(_modes(self._descriptor, self._kind, self._settings)), self._settings, self._path)
+        self._form, self._pitch = _set_format(self._descriptor, self._kind, wanted, self._settings, self._path)
+        fps = _set_rate(self._descriptor, self._kind, self._settings.fps or wanted.fps)
         self.mode = Mode(wanted.pixel_format, self._form.width, self._form.height, fps)
-        self.exposure_s = _set_controls(self._descriptor, self._settings, self._path)
-        request = api.v4l2_requestbuffers(count=_N_BUFFERS, type=_CAPTURE, memory=_MAPPED)
-        ioctl(self._descriptor, api.VIDIOC_REQBUFS, request)
+        set_controls = partial(_set_controls, self._descriptor, self._settings, self._form.width, self._path)
+        set_controls()
+        request = api.v4l2_requestbuffers(count=_N_BUFFERS, type=self._kind, memory=_MAPPED)
+        _ask(self._descriptor, api.VIDIOC_REQBUFS, request)
         for index in range(request.count):
-            buffer = _buffer(index)
-            ioctl(self._descriptor, api.VIDIOC_QUERYBUF, buffer)
-            self._maps.append(opened.enter_context(mmap.mmap(self._descriptor, buffer.length, offset=buffer.m.offset)))
+            buffer = _buffer(self._kind, index)
+            _ask(self._descriptor, api.VIDIOC_QUERYBUF, buffer)
+            place = buffer.m.offset if self._kind == _CAPTURE else _luma_plane(buffer).m.mem_offset
+            length = _luma_plane(buffer).length
+            self._maps.append(opened.enter_context(mmap.mmap(self._descriptor, length, offset=place)))
             self._give_back(buffer)
-        ioctl(self._descriptor, api.VIDIOC_STREAMON, ctypes.c_int(_CAPTURE))
+        _ask(self._descriptor, api.VIDIOC_STREAMON, ctypes.c_int(self._kind))
+        self.exposure_s = set_controls()  # again, for some cameras forget them when the stream begins
         self.counts.connections += 1
 
     # -- taking frames ------------------------------------------------------------------------------------------------
@@ -228,10 +239,13 @@ class Camera:
         """The newest whole capture; those before it go back to the driver unseen. None where none came for a while."""
         newest, n_captures = None, 0
         while select.select([self._descriptor], [], [], 0.0 if n_captures else _POLL_S)[0]:
-            buffer = _buffer()
+            buffer = _buffer(self._kind)
             try:
                 ioctl(self._descriptor, api.VIDIOC_DQBUF, buffer)
-            except BlockingIOError:
+            except OSError as error:
+                if error.errno not in (errno.EAGAIN, errno.EIO):
+                    raise
+                self.counts.damaged += error.errno == errno.EIO  # which may pass; if not, nothing comes any more
                 time.sleep(_NO_DATA_SLEEP_S)
                 break
             n_captures += 1
@@ -256,22 +270,22 @@ class Camera:
             self._give_back(buffer)
 
     def _give_back(self, buffer: Any) -> None:
-        ioctl(self._descriptor, api.VIDIOC_QBUF, _buffer(buffer.index))
+        _ask(self._descriptor, api.VIDIOC_QBUF, _buffer(self._kind, buffer.index))
 
     def _luma(self, buffer: Any) -> Luma | None:
         """A copy (height, width) of the luma in a buffer; None where it is damaged."""
-        data = self._maps[buffer.index]
-        if self.mode.pixel_format == "MJPG":
+        data, used = self._maps[buffer.index], _luma_plane(buffer).bytesused
+        if self.mode.pixel_format in _COMPRESSED:
             from rxcli.ingest.jpeg import decode_luma
 
             with suppress(InputError):
-                return decode_luma(data[: buffer.bytesused], self._path)
+                return decode_luma(data[:used], self._path)
             return None
         pixels, width, height = PIXEL_FORMATS[self.mode.pixel_format], self.mode.width, self.mode.height
         dtype = np.dtype(pixels.dtype)
         row = width * pixels.step * dtype.itemsize
-        pitch = max(self._form.bytesperline, row)
-        if min(buffer.bytesused, len(data)) < pitch * (height - 1) + row:
+        pitch = max(self._pitch, row)
+        if min(used, len(data)) < pitch * (height - 1) + row:
             return None
         samples: NDArray[Any] = np.ndarray((height, width * pixels.step), dtype, data, strides=(pitch, dtype.itemsize))
         return samples[:, pixels.start :: pixels.step].copy()
@@ -303,8 +317,8 @@ def list_modes(path: Path) -> list[Mode]:
     with _explained(path):
         descriptor = _open(path)
         try:
-            _check_capture(descriptor, path)
-            return sorted(_modes(descriptor), key=_merit, reverse=True)
+            _, kind = _check_capture(descriptor, path)
+            return sorted(_modes(descriptor, kind, CameraSettings()), key=_merit, reverse=True)
         finally:
             os.close(descriptor)
 
@@ -335,14 +349,15 @@ _FAILURES = {
     errno.EBUSY: (CameraLost, "another program uses the camera", "close it (`fuser -v {path}` names it)"),
     errno.ENOSPC: (CameraLost, "its USB port has no room left for this mode", _ROOM),
     errno.ENOMEM: (CameraLost, "the driver has no memory for this mode", "lower --width and --height"),
+    errno.EPERM: (InputError, "this process may not use it", "give its container the device, or lift the rule"),
     errno.EACCES: (InputError, "permission denied", "add yourself to the group `video` and log in again"),
     errno.ENOTTY: (InputError, _REFUSED, "name another /dev/video device"),
     errno.EINVAL: (InputError, _REFUSED, "name another /dev/video device"),
 }
 
 
-def _check_capture(descriptor: int, path: Path) -> str:
-    """The camera's name.
+def _check_capture(descriptor: int, path: Path) -> tuple[str, int]:
+    """The camera's name, and its type of buffers.
 
     Raises:
         InputError: the device is none that streams pictures.
@@ -352,34 +367,59 @@ def _check_capture(descriptor: int, path: Path) -> str:
         raise InputError(f"{path}: is no V4L2 device", "name a camera, such as /dev/video0")
     able = capability.capabilities
     able = capability.device_caps if able & api.V4L2_CAP_DEVICE_CAPS else able
-    needed = api.V4L2_CAP_VIDEO_CAPTURE | api.V4L2_CAP_STREAMING
-    if able & needed != needed:
+    captures = able & (api.V4L2_CAP_VIDEO_CAPTURE | api.V4L2_CAP_VIDEO_CAPTURE_MPLANE)
+    if not (captures and able & api.V4L2_CAP_STREAMING):
         raise InputError(f"{path}: does not stream pictures", "name the camera's other /dev/video device")
-    return bytes(capability.card).partition(b"\0")[0].decode("utf-8", "replace")
+    card = bytes(capability.card).partition(b"\0")[0].decode("utf-8", "replace")
+    return card, _CAPTURE if captures & api.V4L2_CAP_VIDEO_CAPTURE else _PLANES
 
 
 def _is_known(descriptor: int, request: int, argument: Any) -> bool:
     """Make a system call; whether the driver knows it and does not refuse its argument."""
     try:
-        ioctl(descriptor, request, argument)
+        _ask(descriptor, request, argument)
     except OSError as error:
-        if error.errno in (errno.EINVAL, errno.ENOTTY, errno.EACCES, errno.ERANGE):
+        if error.errno in (errno.EINVAL, errno.ENOTTY, errno.EACCES, errno.EPERM, errno.ERANGE):
             return False
         raise
     return True
 
 
-def _modes(descriptor: int) -> Iterator[Mode]:
-    """Modes of known pixel formats; of a range of sizes or rates the largest."""
-    for form in _enumerate(descriptor, api.VIDIOC_ENUM_FMT, api.v4l2_fmtdesc, _CAPTURE):
+def _ask(descriptor: int, request: int, argument: Any) -> None:
+    """Make a system call, again where it fails as transfers on USB do now and then."""
+    for attempt in range(1, _ATTEMPTS + 1):
+        try:
+            ioctl(descriptor, request, argument)
+        except OSError as error:
+            if error.errno != errno.EIO or attempt == _ATTEMPTS:
+                raise
+        else:
+            return
+
+
+def _modes(descriptor: int, kind: int, settings: CameraSettings) -> Iterator[Mode]:
+    """Modes of known pixel formats; of a range of sizes the one that is asked for, or the largest."""
+    for form in _enumerate(descriptor, api.VIDIOC_ENUM_FMT, api.v4l2_fmtdesc, kind):
         code, name = form.pixelformat, _name_of(form.pixelformat)
-        sizes = _enumerate(descriptor, _FRAME_SIZES, ctypes.c_uint32 * _N_SIZE, code)
-        for _, _, kind, *sides in sizes if name in PIXEL_FORMATS else ():
-            # Width and height; of a range the least, largest and step of either.
-            width, height = sides[:2] if kind == api.V4L2_FRMSIZE_TYPE_DISCRETE else sides[1:5:3]
+        for width, height in _sizes(descriptor, kind, code, settings) if name in PIXEL_FORMATS else ():
             intervals = _enumerate(descriptor, _FRAME_INTERVALS, ctypes.c_uint32 * _N_INTERVAL, code, width, height)
             rates = (denominator / numerator for *_, numerator, denominator in (i[5:7] for i in intervals) if numerator)
             yield Mode(name, width, height, max(rates, default=0.0))
+
+
+def _sizes(descriptor: int, kind: int, code: int, settings: CameraSettings) -> Iterator[tuple[int, int]]:
+    """Sizes of a pixel format; if the driver lists none, the one that is asked for, or the one that is set."""
+    sizes = list(_enumerate(descriptor, _FRAME_SIZES, ctypes.c_uint32 * _N_SIZE, code))
+    for _, _, listed, *sides in sizes:
+        if listed == api.V4L2_FRMSIZE_TYPE_DISCRETE:
+            yield sides[0], sides[1]
+            continue
+        ranges = zip((settings.width, settings.height), (sides[:2], sides[3:5]), strict=True)
+        width, height = (asked if asked and low <= asked <= high else high for asked, (low, high) in ranges)
+        yield width, height
+    form = api.v4l2_format(type=kind)
+    if not sizes and _is_known(descriptor, api.VIDIOC_G_FMT, form):
+        yield settings.width or form.fmt.pix.width, settings.height or form.fmt.pix.height
 
 
 def _enumerate(descriptor: int, request: int, structure: Callable[..., Any], *fields: int) -> Iterator[Any]:
@@ -419,20 +459,25 @@ def _choose(modes: list[Mode], settings: CameraSettings, path: Path) -> Mode:
     raise InputError(f"{path}: does not offer {asked}", f"it offers {', '.join(str(mode) for mode in modes)}")
 
 
-def _set_format(descriptor: int, mode: Mode, path: Path) -> Any:
-    """Set the format of a mode; returns the one in effect, with the size and the bytes of a row."""
+def _set_format(descriptor: int, kind: int, mode: Mode, settings: CameraSettings, path: Path) -> tuple[Any, int]:
+    """Set the format of a mode; returns the one in effect, and the bytes of a row of luma."""
     code = api.v4l2_fourcc(*mode.pixel_format.ljust(4))
-    form = api.v4l2_format(type=_CAPTURE)
-    form.fmt.pix = api.v4l2_pix_format(mode.width, mode.height, code, api.V4L2_FIELD_NONE)
-    ioctl(descriptor, api.VIDIOC_S_FMT, form)
-    if (got := form.fmt.pix.pixelformat) != code:  # a driver may answer with the nearest that it has
-        raise InputError(f"{path}: gives {_name_of(got)} instead of {mode.pixel_format}", "ask for another --format")
-    return form.fmt.pix
+    form = api.v4l2_format(type=kind)
+    got = form.fmt.pix if kind == _CAPTURE else form.fmt.pix_mp
+    got.width, got.height, got.pixelformat, got.field = mode.width, mode.height, code, api.V4L2_FIELD_NONE
+    _ask(descriptor, api.VIDIOC_S_FMT, form)
+    if got.pixelformat != code:  # a driver may answer with the nearest that it has
+        given = _name_of(got.pixelformat)
+        raise InputError(f"{path}: gives {given} instead of {mode.pixel_format}", "ask for another --format")
+    if (settings.width or got.width, settings.height or got.height) != (got.width, got.height):
+        reason = f"{path}: gives {got.width} x {got.height} instead of {mode.width} x {mode.height}"
+        raise InputError(reason, "ask for that --width and --height")
+    return got, (got if kind == _CAPTURE else got.plane_fmt[0]).bytesperline
 
 
-def _set_rate(descriptor: int, fps: float) -> float:
+def _set_rate(descriptor: int, kind: int, fps: float) -> float:
     """Ask for a frame rate; returns the actual one, 0 if it is not reported."""
-    parameters = api.v4l2_streamparm(type=_CAPTURE)
+    parameters = api.v4l2_streamparm(type=kind)
     interval = parameters.parm.capture.timeperframe
     if fps > 0:
         interval.numerator, interval.denominator = 1000, round(1000 * fps)
@@ -441,22 +486,41 @@ def _set_rate(descriptor: int, fps: float) -> float:
     return float(interval.denominator / interval.numerator)
 
 
-def _set_controls(descriptor: int, settings: CameraSettings, path: Path) -> float | None:
-    """Fix the exposure, the shortest if none is requested, and a requested gain; returns the actual exposure, or None.
+def _set_controls(descriptor: int, settings: CameraSettings, width: int, path: Path) -> float | None:
+    """Fix the exposure, a short one if none is requested, and a requested gain; returns the actual exposure, or None.
 
     Raises:
         InputError: one is asked for and the camera has no such control.
     """
     _set(descriptor, api.V4L2_CID_EXPOSURE_AUTO, api.V4L2_EXPOSURE_MANUAL)
     _set(descriptor, api.V4L2_CID_EXPOSURE_AUTO_PRIORITY, 0)  # else the camera lowers its rate in the dark
-    units = _set(descriptor, api.V4L2_CID_EXPOSURE_ABSOLUTE, round((settings.exposure_s or 0.0) / _EXPOSURE_UNIT_S))
-    if units is None and settings.exposure_s is not None:
-        raise InputError(f"{path}: the camera has no exposure control", "leave --exposure out")
+    unit_s: float | None = _EXPOSURE_UNIT_S
+    wanted_s = settings.exposure_s or _SHORT_S
+    units = _set(descriptor, api.V4L2_CID_EXPOSURE_ABSOLUTE, round(wanted_s / _EXPOSURE_UNIT_S))
+    if units is None:  # sensors on a board count lines
+        unit_s = _line_s(descriptor, width)
+        units = _set(descriptor, api.V4L2_CID_EXPOSURE, round(wanted_s / unit_s) if unit_s else 0)
+    if settings.exposure_s is not None and (units is None or unit_s is None):
+        lacks = "has no exposure control" if units is None else "counts its exposure in lines of unknown duration"
+        raise InputError(f"{path}: the camera {lacks}", "leave --exposure out")
     if settings.gain is not None:
         _set(descriptor, api.V4L2_CID_AUTOGAIN, 0)
-        if _set(descriptor, api.V4L2_CID_GAIN, settings.gain) is None:
+        gains = (
+            _set(descriptor, control, settings.gain) for control in (api.V4L2_CID_GAIN, api.V4L2_CID_ANALOGUE_GAIN)
+        )
+        if all(gain is None for gain in gains):
             raise InputError(f"{path}: the camera has no gain control", "leave --gain out")
-    return None if units is None else units * _EXPOSURE_UNIT_S
+    return None if units is None or unit_s is None else units * unit_s
+
+
+def _line_s(descriptor: int, width: int) -> float | None:
+    """Time from line to line of a sensor, by its pixels a line and a second; None if the driver does not state it."""
+    values = (api.v4l2_ext_control * 2)()
+    values[0].id, values[1].id = api.V4L2_CID_HBLANK, api.V4L2_CID_PIXEL_RATE
+    request = api.v4l2_ext_controls(count=2, controls=values)
+    if not _is_known(descriptor, api.VIDIOC_G_EXT_CTRLS, request) or values[1].value64 <= 0:
+        return None
+    return float((width + values[0].value) / values[1].value64)
 
 
 def _set(descriptor: int, control: int, value: int) -> int | None:
@@ -470,5 +534,14 @@ def _set(descriptor: int, control: int, value: int) -> int | None:
     return int(state.value) if known else None
 
 
-def _buffer(index: int = 0) -> Any:
-    return api.v4l2_buffer(index=index, type=_CAPTURE, memory=_MAPPED)
+def _buffer(kind: int, index: int = 0) -> Any:
+    buffer = api.v4l2_buffer(index=index, type=kind, memory=_MAPPED)
+    if kind == _PLANES:
+        # One more, because the package's structure lacks four bytes behind the fields that are read here.
+        buffer.m.planes, buffer.length = (api.v4l2_plane * (_N_PLANES + 1))(), _N_PLANES
+    return buffer
+
+
+def _luma_plane(buffer: Any) -> Any:
+    """What states length and used bytes of a buffer's luma."""
+    return buffer.m.planes[0] if buffer.type == _PLANES else buffer

@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import ENVIRONMENT
-from fake_camera import Bench
+from fake_camera import FORMATS as FAKE_FORMATS
+from fake_camera import OTHERS, Bench
 
 from rxcli.cli.live import Status, format_status
 from rxcli.cli.main import run
-from rxcli.errors import ExitCode
+from rxcli.errors import ExitCode, InputError
 from rxcli.ingest.v4l2 import CameraCounts, LiveSource
 from rxcli.results.aim import Aim
 from rxcli.results.report import wrapped
@@ -44,16 +45,21 @@ FORMATS = [
     ("YUYV", 0, 16, 235),
     ("NV12", 0, 16, 235),
     ("MJPG", 0, 0, 255),
+    *((name, 0, 16, 235) for name in ("NV21", "YU12", "YV12", "NM12", "YM12", "YVYU")),
+    ("JPEG", 0, 0, 255),
 ]
 
 
+@pytest.mark.parametrize("faults", [{}, {"planes": True}], ids=["one plane", "planes"])
 @pytest.mark.parametrize(("name", "shift", "black", "white"), FORMATS, ids=[form[0] for form in FORMATS])
-def test_luma_arrives_as_sent(bench: Bench, name: str, shift: int, black: float, white: float) -> None:
-    seen = bench.read({"pixel_format": name})
+def test_luma_arrives_as_sent(
+    bench: Bench, name: str, shift: int, black: float, white: float, faults: dict[str, bool]
+) -> None:
+    seen = bench.read({"pixel_format": name}, faults=faults, formats=tuple(FAKE_FORMATS | OTHERS))
     assert (seen.error, len(seen.frames)) == (None, N_FRAMES)
     sent = bench.luma.astype(int) << shift
     for frame in seen.frames:
-        assert np.abs(sent - frame.pixels).max(axis=(1, 2)).min() <= (2 if name == "MJPG" else 0)
+        assert np.abs(sent - frame.pixels).max(axis=(1, 2)).min() <= (2 if "JP" in name else 0)
         assert (frame.black, frame.white, frame.metadata.model) == (black, white, "Fake camera")
         assert frame.pixels.dtype == ("uint16" if shift else "uint8")
     assert bench.camera.format.strip() == name
@@ -120,6 +126,72 @@ def test_a_camera_that_cannot_be_read_says_why(bench: Bench, faults: dict[str, i
     seen = bench.read({"stall_s": 0.3}, faults=faults)
     assert seen.error.startswith(reason)
     assert len(seen.frames) <= faults.get("stall_after", 0)
+
+
+def test_a_first_frame_may_be_late(bench: Bench) -> None:
+    seen = bench.read({"stall_s": 0.1}, 2, faults={"start_s": 0.5})
+    assert (seen.error, len(seen.frames)) == (None, 2)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "asked", "size"),
+    [
+        ("none", {}, (96, 64)),
+        ("none", {"width": 48, "height": 32}, (48, 32)),
+        ("range", {}, (96, 64)),
+        ("range", {"width": 48, "height": 32}, (48, 32)),
+        ("range", {"height": 40}, (96, 40)),
+    ],
+)
+def test_sizes_that_are_not_listed(bench: Bench, sizes: str, asked: dict[str, int], size: tuple[int, int]) -> None:
+    seen = bench.read(asked, 2, faults={"sizes": sizes}, formats=("YUYV",))
+    assert (seen.error, [(frame.width, frame.height) for frame in seen.frames]) == (None, [size] * 2)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "said"),
+    [("none", "gives 96 x 40 instead of 97 x 41; ask for"), ("range", "does not offer any format 97")],
+)
+def test_sizes_that_cannot_be_had(bench: Bench, sizes: str, said: str) -> None:
+    assert said in bench.read({"width": 97, "height": 41}, 2, faults={"sizes": sizes}, formats=("YUYV",)).error
+
+
+def test_an_exposure_that_the_stream_forgets_is_set_again(bench: Bench) -> None:
+    seen = bench.read({"exposure_s": 0.002}, 1, faults={"reset": True})
+    assert bench.camera.controls[0x9A0902] == 20
+    assert seen.frames[0].metadata.exposure_s == pytest.approx(0.002)
+
+
+@pytest.mark.parametrize(("asked", "lines"), [({}, 10), ({"exposure_s": 0.002, "gain": 99}, 200)])
+def test_an_exposure_in_lines(bench: Bench, asked: dict[str, Any], lines: int) -> None:
+    """Of 96 + 32 pixels, 12.8 million a second: 10 us."""
+    seen = bench.read(asked, 1, faults={"board": 12_800_000})
+    assert bench.camera.controls == {0x980911: lines, 0x9E0903: asked.get("gain", 16)}
+    assert seen.frames[0].metadata.exposure_s == pytest.approx(lines * 1e-5)
+
+
+def test_an_exposure_in_lines_of_unknown_duration(bench: Bench) -> None:
+    seen = bench.read({}, 1, faults={"board": None})
+    assert (bench.camera.controls[0x980911], seen.frames[0].metadata.exposure_s) == (4, None)
+    seen = bench.read({"exposure_s": 0.002}, 1, faults={"board": None})
+    assert "counts its exposure in lines of unknown duration; leave --exposure out" in seen.error
+
+
+def test_a_call_that_fails_now_and_then_is_made_again(bench: Bench) -> None:
+    seen = bench.read({"pixel_format": "GREY"}, 30, faults={"fail_every": 7})
+    assert (seen.error, len(seen.frames), seen.counts.connections) == (None, 30, 1)
+    assert bench.read({"stall_s": 0.3}, faults={"fail_every": 1}).error.endswith(
+        "plug it in again; --wait waits for it"
+    )
+
+
+def test_a_camera_that_is_forbidden_says_so(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_path: Path) -> int:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr("rxcli.ingest.v4l2._open", refuse)
+    with pytest.raises(InputError, match="this process may not use it; give its container the device"):
+        list(LiveSource(Path("/dev/video0")))
 
 
 @pytest.mark.parametrize("fault", ["damage_every", "short_every"])
