@@ -74,8 +74,9 @@ def test_the_walk_sees_blocks_and_commands() -> None:
 
 
 def test_ci_finds_the_command_that_runs_the_tests() -> None:
-    """In one line of the docs, which `.ci/run` runs as it stands there."""
-    [line] = re.findall(r"^.*'\.\[test\]'.*$", (ROOT / "docs" / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    """In one line of README, which `.ci/run` runs as it stands there."""
+    assert "grep -F \"'.[test]'\" README.md" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    [line] = re.findall(r"^.*'\.\[test\]'.*$", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert line.startswith("python3 -m venv .venv && ")
     assert line.endswith("-m pytest")
 
