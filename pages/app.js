@@ -95,26 +95,28 @@
     show(entry.answer);
   }
 
+  const received = (answer) => Boolean(answer) && (answer.packets || []).length + (answer.texts || []).length > 0;
+
   function answered(entry, answer) {
     if (!queue.includes(entry)) return; // started over meanwhile
     entry.answer = answer;
     entry.row.disabled = false;
     entry.state.textContent = (answer.texts || []).length ? answer.texts.map((item) => item.text || item.name).join(", ") : answer.headline;
-    entry.state.className = `state ${(answer.packets || []).length ? "ok" : "no_packet"}`;
+    entry.state.className = `state ${received(answer) ? "ok" : "no_packet"}`;
     if (answer.picture) {
       const image = make("img");
       image.src = `data:image/jpeg;base64,${answer.picture.jpeg}`;
       image.alt = "";
       entry.thumb.replaceChildren(image);
     }
-    $("tip").hidden ||= (answer.packets || []).length > 0;
+    $("tip").hidden ||= received(answer);
     if (!chosen || selected === entry) select(entry);
     if (answer.together) together(answer.together);
   }
 
   // What the files of this page have given together; `files` are those under way.
   function together(files) {
-    const read = queue.filter((entry) => entry.answer && (entry.answer.packets || []).length);
+    const read = queue.filter((entry) => received(entry.answer));
     const texts = new Set(read.flatMap((entry) => entry.answer.texts.map((item) => item.text || item.name)));
     $("together").hidden = queue.length < 2 && !files.length;
     $("together-state").textContent = "Photos sent from this page are combined: what one shows in part, another completes. "

@@ -87,6 +87,11 @@ class ScreenProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
         return packet_slots(self.payload_symbols)
 
     @property
+    def packets(self) -> tuple[float, int, int]:
+        """What screens have in common that send the same packets, each of its own number of times."""
+        return self.slot_rate_hz, self.packet_slots, self.columns
+
+    @property
     def packet_s(self) -> float:
         """Duration of one packet in seconds."""
         return self.packet_slots / self.slot_rate_hz

@@ -474,6 +474,8 @@ class FrameSoftBits:
     open_start: bool = False
     #: The same picture read with other, less likely clocks.
     alternatives: tuple[FrameSoftBits, ...] = ()
+    #: Profile of the screen whose packets they are taken for; None in clips.
+    screen_profile: str | None = None
 
 
 MessageKind = Literal["raw", "text", "uri"]
@@ -489,6 +491,8 @@ class Message:
     #: Frame in which it was complete.
     frame: int
     time_s: float
+    #: Photographs that were added up for it, where there are several.
+    photos: tuple[str, ...] = ()
 
     @property
     def text(self) -> str | None:

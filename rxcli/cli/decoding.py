@@ -161,7 +161,8 @@ class _Run:
         #: Packets of less confidence do not count for the limits.
         self._min_confidence = BELIEVABLE if asked is None else asked
         self._baseline = load_baseline(given["baseline"], self._min_confidence, given["slower"])
-        self._limits = summary.Limits(given["max_ber"], given["min_packets"], given["min_packet_confidence"])
+        bounds = ("max_ber", "min_packets", "expected_texts", "min_packet_confidence")
+        self._limits = summary.Limits(**{name: given[name] for name in bounds})
         self._summaries: list[summary.SourceSummary] = []
         self._photos = PhotoCollector(decoder.link_screens, decoder.file_memory_mb)
         #: The frame with the most packets of those whose camera was estimated.
@@ -279,6 +280,9 @@ class _Run:
 
     def _count(self, result: FrameResult, counted: summary.SourceSummary) -> None:
         counted.add(result)
+        for message in result.messages:
+            for photo in (before for before in self._summaries if before.source in message.photos):
+                photo.add_part(message)
         self._baseline.add(result)
         if self._put_payloads is not None and result.packets:
             self._put_payloads(report.payload_rows(result))

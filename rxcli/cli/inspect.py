@@ -52,7 +52,7 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
         for line in format_link(result):
             click.echo(line, err=True)
     click.echo(page)
-    received = any(result.packets for result in results)
+    received = any(result.packets or result.messages or result.objects for result in results)
     return ExitCode.OK if received else ExitCode.NOT_RECEIVED
 
 

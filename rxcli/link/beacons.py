@@ -15,7 +15,7 @@ from rxcli.link import ldpc
 from rxcli.link.formats import unprotect_beacon
 from rxcli.link.known_bits import KnownBits, known_bits
 from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
-from rxcli.link.placement import Placement, possible_placements
+from rxcli.link.placement import Found, Placement, possible_placements
 from rxcli.link.softbits import LN2, MIN_SIMILARITY, TRY_FROM, Float32, log_likelihood, same_bits_llr, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
@@ -52,6 +52,8 @@ class _Round:
     tried: dict[tuple[int, int, int], float] = field(default_factory=dict)
     #: The decoded message.
     found: tuple[MessageKind, bytes] | None = None
+    #: What was added.
+    sources: tuple[str, ...] = ()
 
     def similarity(self) -> float:
         """Log-likelihood ratio of all bursts carrying one message."""
@@ -115,8 +117,8 @@ class BeaconSearch:
         #: Failed attempts in a row, and bursts since the last attempt.
         self._fruitless = self._waited = 0
 
-    def add(self, soft: FrameSoftBits, settled: Placement | None) -> list[tuple[tuple[MessageKind, bytes], Placement]]:
-        """Add bursts and return the messages found with them, known ones included, with the placement of the columns.
+    def add(self, soft: FrameSoftBits, settled: Placement | None) -> list[Found]:
+        """Add bursts and return the messages found with them, known ones included.
 
         Args:
             soft: the bursts.
@@ -128,7 +130,7 @@ class BeaconSearch:
             if candidate is not None:
                 self._try(candidate, settled)
                 if candidate.found is not None:
-                    found.append((candidate.found, candidate.placement))
+                    found.append(Found(candidate.found, candidate.placement, candidate.sources))
         return found
 
     def _joined(self, period: int, soft: FrameSoftBits, settled: Placement | None) -> _Round | None:
@@ -153,6 +155,7 @@ class BeaconSearch:
         choices.insert(0, (MIN_SIMILARITY, blank, 0, as_numbered))
         _, candidate, phase, placement = max(choices, key=itemgetter(0))
         candidate.add(frame, phase, placement, soft.epoch)
+        candidate.sources = tuple(dict.fromkeys((*candidate.sources, soft.source)))
         self._rounds[period] = [*(known for known in rounds if known is not candidate), candidate][-_MAX_ROUNDS:]
         return candidate
 

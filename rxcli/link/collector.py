@@ -24,18 +24,21 @@ class Collector:
 
     def __init__(self, screens: Sequence[ScreenProfile], file_memory_mb: int = FILE_MEMORY_MB) -> None:
         self._under_way = FilesUnderWay(file_memory_mb)
+        self._screens = screens
         self._shapes = {(screen.columns, screen.payload_symbols) for screen in screens}
         #: Receivers by columns and payload symbols.
         self._receivers: dict[tuple[int, int], LinkReceiver] = {}
         #: Placement of the source's columns; None until a message or file decides.
         self._placement: Placement | None = None
         self._source = ""
+        #: Profile of the screen that sends the source's text, None until there is one.
+        self._screen: str | None = None
 
     def add(self, result: FrameResult) -> FrameResult:
         """Replace the soft bits of a result by what they complete, and number its columns as that shows."""
         soft, result = result.soft_bits, replace(result, soft_bits=None)
         if result.source != self._source:  # the next photo may come from a different camera
-            self._source, self._placement = result.source, None
+            self._source, self._placement, self._screen = result.source, None, None
         events, by_shape = list[Event](), defaultdict[tuple[int, int], list[FrameSoftBits]](list)
         for candidate in () if soft is None else (soft, *soft.alternatives):
             by_shape[candidate.llr.shape[2], candidate.llr.shape[1]].append(candidate)
@@ -47,12 +50,25 @@ class Collector:
                 self._receivers[shape] = LinkReceiver(*shape, self._under_way)
             receiver = self._receivers[shape]
             receiver.placement = self._placement
-            events += receiver.add(replace(likeliest, alternatives=tuple(less_likely)))
+            came = receiver.add(replace(likeliest, alternatives=tuple(less_likely)))
+            if any(isinstance(event, Message) for event in came):
+                self._screen = self._sender(likeliest.screen_profile or result.screen_profile)
+            events += came
             self._placement = receiver.placement
         if self._placement is not None:
             n_columns = len(result.columns) or (0 if soft is None else soft.llr.shape[2])
             result = placed(result, self._placement, n_columns)
+        if self._screen is not None and (events or result.packets):
+            result = replace(result, screen_profile=self._screen)
+        if events and result.status in ("no_signal", "no_screen"):  # what held no packet was a part of them
+            result = replace(result, status="ok", message=None, columns=(), skipped={})
         return with_events(result, events)
+
+    def _sender(self, name: str | None) -> str | None:
+        """The screen that sends texts in the packets of another: of those alike the one with the fewest copies."""
+        packets = [screen.packets for screen in self._screens if screen.name == name]
+        alike = [screen for screen in self._screens if screen.packets in packets]
+        return min(alike, key=lambda screen: screen.repeats).name if alike else None
 
     def finish(self, last: FrameResult) -> FrameResult:
         """Add the remaining messages and files, complete or not, to the last result of the source."""

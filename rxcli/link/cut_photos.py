@@ -8,11 +8,10 @@ import numpy as np
 from rxcli.link.beacons import gathered, read_beacons
 from rxcli.link.known_bits import known_bits
 from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
-from rxcli.link.placement import Placement, possible_placements
+from rxcli.link.placement import Found, Placement, possible_placements
 from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, same_bits_llr, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
-Found = tuple[tuple[MessageKind, bytes], Placement]
 #: Largest number of sums of photographs that are kept, of ways to read one, and of sums that are decoded at once.
 _MAX_SUMS, _MAX_VIEWS, _BATCH = 192, 96, 64
 #: Views of a photograph that are decoded by themselves first; and log-likelihood ratio of zeros that ranks views.
@@ -31,6 +30,7 @@ class _Sum:
     level: float
     #: Of the last photograph.
     placement: Placement
+    sources: tuple[str, ...]
     #: Log-likelihood ratio of the zeros after a message, of each photograph by itself.
     zeros: float = 0.0
     #: Whether it is the sum of one photograph's bursts, which the search for beacons has tried.
@@ -56,7 +56,7 @@ class CutPhotos:
         self._sums: list[_Sum] = []
 
     def add(self, soft: FrameSoftBits) -> list[Found]:
-        """Add a photograph, and return the text that it completes with the placement of its columns."""
+        """Add a photograph, and return the text that it completes."""
         views = self._ranked(list(_views(soft)))[:_MAX_VIEWS]
         joined = [pair for known in self._sums for view in views if (pair := _joined(known, view)) is not None]
         joined.sort(key=lambda s: -s.rank)
@@ -72,7 +72,7 @@ class CutPhotos:
             found = next(_read(layout, untried), None)
             if found is not None:
                 self._sums = [found[1]]
-                return [(found[0], found[1].placement)]
+                return [Found(found[0], found[1].placement, found[1].sources)]
         return []
 
     def _ranked(self, views: list[_Sum]) -> list[_Sum]:
@@ -114,7 +114,7 @@ def _views(soft: FrameSoftBits) -> Iterator[_Sum]:
                 for placement in groups[group]:
                     total = placement.of(moved)
                     is_tried = candidate is soft and not soft.open_start
-                    yield _Sum(total, 0.0, _level(total), placement, is_tried=is_tried)
+                    yield _Sum(total, 0.0, _level(total), placement, (soft.source,), is_tried=is_tried)
 
 
 def _level(total: Float32) -> float:
@@ -128,4 +128,5 @@ def _joined(known: _Sum, view: _Sum) -> _Sum | None:
     gain = level - known.level - view.level
     if gain < MIN_SIMILARITY:
         return None
-    return _Sum(total, known.similarity + gain, level, view.placement, known.zeros + view.zeros)
+    sources = (*known.sources, *view.sources)
+    return _Sum(total, known.similarity + gain, level, view.placement, sources, known.zeros + view.zeros)

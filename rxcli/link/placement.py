@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.link.softbits import information
-from rxcli.types import ColumnResult, FloatArray, FrameResult, PacketResult, Remark
+from rxcli.types import ColumnResult, FloatArray, FrameResult, MessageKind, PacketResult, Remark
 
 #: Largest shift that is tried, columns; and information from which a column is one of the screen's, relative to that of
 #: the column with the most.
@@ -45,6 +45,14 @@ class Placement:
     def inverse(self) -> Placement:
         """The placement that undoes this one."""
         return Placement(self.mirrored, self.shift if self.mirrored else -self.shift)
+
+
+class Found(NamedTuple):
+    """A decoded message, with the placement of the columns and the sources that were added up for it."""
+
+    content: tuple[MessageKind, bytes]
+    placement: Placement
+    sources: tuple[str, ...]
 
 
 def possible_placements(llr: NDArray[np.floating]) -> list[list[Placement]]:

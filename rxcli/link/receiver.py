@@ -10,9 +10,9 @@ from rxcli.link.cut_photos import CutPhotos
 from rxcli.link.files import FileSearch, FileState, FilesUnderWay
 from rxcli.link.formats import Container
 from rxcli.link.layout import LABEL_BITS
-from rxcli.link.placement import Placement
+from rxcli.link.placement import Found, Placement
 from rxcli.link.softbits import MAX_LLR, Event
-from rxcli.types import FrameSoftBits, Message, MessageKind, ObjectProgress, ReceivedObject
+from rxcli.types import FrameSoftBits, Message, ObjectProgress, ReceivedObject
 
 
 class LinkReceiver:
@@ -49,7 +49,7 @@ class LinkReceiver:
             return []
         self._last = soft
         events: list[Event] = []
-        found: list[tuple[tuple[MessageKind, bytes], Placement]] = []
+        found: list[Found] = []
         if not soft.open_start:
             events += [self._object(soft, *complete) for complete in self._files.add(soft, self.placement)]
             announced = self._files.placement(soft.epoch)
@@ -59,19 +59,19 @@ class LinkReceiver:
             found = self._beacons.add(soft, self.placement)
         if not found and (soft.source or soft.open_start):  # a photograph
             found = self._cut_photos.add(soft)
-        self.placement = found[-1][1] if found else self.placement
-        return events + self._new_messages(soft, [message for message, _ in found])
+        self.placement = found[-1].placement if found else self.placement
+        return events + self._new_messages(soft, found)
 
     def finish(self) -> list[Event]:
         """Decode the rest at the end of the transmission."""
         return [self._object(self._last, *found) for found in self._files.finish() if self._last is not None]
 
-    def _new_messages(self, soft: FrameSoftBits, found: Sequence[tuple[MessageKind, bytes]]) -> list[Event]:
+    def _new_messages(self, soft: FrameSoftBits, found: Sequence[Found]) -> list[Event]:
         known = {(message.kind, message.data) for message in self.messages}
         new = [
-            Message(kind, data, soft.source, soft.frame, soft.time_s)
-            for kind, data in dict.fromkeys(found)
-            if (kind, data) not in known
+            Message(*content, soft.source, soft.frame, soft.time_s, sources if len(sources) > 1 else ())
+            for content, sources in {content: sources for content, _, sources in found}.items()
+            if content not in known
         ]
         self.messages += new
         return list(new)

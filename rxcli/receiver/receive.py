@@ -159,7 +159,7 @@ def _receive_screen(
         columns=columns,
         denoiser=report,
         skipped=reception.skipped,
-        soft_bits=soft_bits(frame, reception, no_header, denoised) if options.soft_bits else None,
+        soft_bits=soft_bits(frame, acquisition.screen, reception, no_header, denoised) if options.soft_bits else None,
     )
     if result.status == "no_signal":
         remark = too_small(context, acquisition.screen) or assemble.why_no_packet(columns)

@@ -54,7 +54,10 @@ def _details(result: FrameResult) -> dict[str, Any]:
         "estimated": result.estimated,
         "skipped": result.skipped,
         "denoiser": result.denoiser,
-        "messages": [{"kind": m.kind, **_present(m, "text"), "hex": m.data.hex()} for m in result.messages],
+        "messages": [
+            {"kind": m.kind, **_present(m, "text"), "hex": m.data.hex()} | ({"photos": m.photos} if m.photos else {})
+            for m in result.messages
+        ],
         "objects": [_blocks(_written(received, _OBJECT)) for received in result.objects],
         "objects_incomplete": [_blocks(_written(progress, _PROGRESS)) for progress in result.progress],
         "link_notes": list(result.link_notes),
@@ -124,7 +127,7 @@ def from_record(record: dict[str, Any]) -> FrameResult:
         about["estimated"] = {name: [*map(_number, pair)] for name, pair in record.get("estimated", {}).items()}
         files = [{**o, **place, "n_blocks": o["blocks"]} for o in record.get("objects", ())]
         under_way = [{**p, "n_blocks": p["blocks"]} for p in record.get("objects_incomplete", ())]
-        messages = [Message(m["kind"], bytes.fromhex(m["hex"]), **place) for m in record.get("messages", ())]
+        messages = [_read(m, Message, data=bytes.fromhex(m["hex"]), **place) for m in record.get("messages", ())]
         result: FrameResult = _read(
             {**record, **about},
             FrameResult,

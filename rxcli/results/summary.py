@@ -13,7 +13,7 @@ from rxcli.outputs import replacing, write_whole
 from rxcli.results import report
 from rxcli.results.report import count_packets, plural, printable_name
 from rxcli.results.truth import EXPECTED_LENGTHS, Fault, Score
-from rxcli.types import BELIEVABLE, FrameResult
+from rxcli.types import BELIEVABLE, FrameResult, Message
 
 #: Packets that one sentence names.
 _MAX_NAMED = 6
@@ -30,8 +30,10 @@ class Limits:
 
     #: Highest bit error rate, lost packets included; None: any.
     max_ber: float | None = None
-    #: Fewest packets of `SourceSummary.min_confidence`.
+    #: Fewest packets of `SourceSummary.min_confidence`; a text or a file counts as one.
     min_packets: int = 1
+    #: Texts that must come.
+    expected_texts: tuple[str, ...] = ()
     #: Lowest confidence that a packet may have; None: any.
     min_packet_confidence: float | None = None
 
@@ -58,8 +60,9 @@ class SourceSummary:
     #: What it was received with.
     screen: str | None = None
     camera: str | None = None
-    #: Texts and files, a line each; incomplete files, and files that could not be written.
+    #: Texts and files, a line each, and the texts themselves; incomplete files, and files that could not be written.
     came: list[str] = field(default_factory=list)
+    texts: set[str] = field(default_factory=set)
     incomplete: list[str] = field(default_factory=list)
     unwritten: list[str] = field(default_factory=list)
     lowest_confidence: float = math.inf
@@ -101,10 +104,18 @@ class SourceSummary:
         self.first_s, self.last_s = min(self.first_s, result.time_s), max(self.last_s, result.time_s)
         self.screen, self.camera = result.screen_profile or self.screen, result.camera_profile or self.camera
         self.came += report.format_received(result)
+        self.texts.update(message.text for message in result.messages if message.text is not None)
         self.incomplete += map(report.format_progress, result.progress)
         failed = [column.message for column in result.columns if column.status != "ok"]
         for reason in filter(None, (result.message, *failed)):
             self.reasons[self._kinds.setdefault(re.sub(r"\d+(\.\d+)?", "#", reason), reason)] += 1
+
+    def add_part(self, message: Message) -> None:
+        """Count a text that this photograph showed in part, and another one completed."""
+        self.n["messages"] += 1
+        self.n["frames_failed"] = 0
+        self.texts.add(message.text or "")
+        self.reasons = Counter({f"completed by {printable_name(message.source)}": 1})
 
     @property
     def is_clip(self) -> bool:
@@ -115,7 +126,13 @@ class SourceSummary:
     def is_complete(self) -> bool:
         """Whether every column gave a packet that can be believed, in every burst of a clip."""
         expected = self.n_columns * max(len(self.bursts), 1)
-        return not (self.n["frames_failed"] or self.n["unsure"]) and self.n["received"] >= expected > 0
+        is_whole = self.n["received"] >= expected > 0 or (self.n_came > 0 and not self.n_columns)
+        return is_whole and not (self.n["frames_failed"] or self.n["unsure"])
+
+    @property
+    def n_came(self) -> int:
+        """Number of texts and files."""
+        return self.n["messages"] + self.n["files"]
 
     @property
     def confidence(self) -> float | None:
@@ -145,14 +162,15 @@ class SourceSummary:
         """What was not received, or not well enough."""
         n, lowest, least = self.n, self.lowest_confidence, limits.min_packet_confidence
         if n["frames"] and not n["unreadable"]:
-            if not (n["packets"] or n["messages"] or n["files"]):
+            if not (n["packets"] or self.n_came):
                 yield f"no packet: {self.reason}" if self.reason else "no packet"
-            elif n["sure"] < limits.min_packets:
+            elif n["sure"] + self.n_came < limits.min_packets:
                 counted, asked = count_packets(n["sure"], n["packets"] - n["sure"]), limits.min_packets
                 of_them = "" if self.min_confidence == BELIEVABLE else f" (confidence {self.min_confidence:g} or more)"
                 yield f"{counted}; {asked} {'was' if asked == 1 else 'were'} asked for{of_them}"
         if least is not None and lowest < least:
             yield f"a packet has a confidence of {lowest:.4g}, below {least:g}"
+        yield from (f"the text {text!r} did not come" for text in limits.expected_texts if text not in self.texts)
         yield from (*self.regressions, *self.unwritten)
         if limits.max_ber is not None and n["frames"]:
             if self.score is None:
@@ -308,7 +326,8 @@ def write_junit(path: Path, summaries: Sequence[SourceSummary], limits: Limits) 
             element = ElementTree.SubElement(case, kind, message=printable(reasons), type=code.name.lower())
             element.text = "\n".join(map(str, summary.faults)) or None
             kinds[kind] += 1
-        ElementTree.SubElement(case, "system-out").text = count_packets(row["received"], row["unsure"])
+        counted = count_packets(row["received"], row["unsure"])
+        ElementTree.SubElement(case, "system-out").text = "\n".join([*summary.came, counted])
     counts = {"tests": len(summaries), "errors": kinds["error"], "failures": kinds["failure"]}
     suite.attrib |= {name: str(count) for name, count in counts.items()}
     suite.set("time", f"{sum(summary.time_ms for summary in summaries) / 1e3:.3f}")

@@ -357,13 +357,14 @@ class _Gathered(Previews):
         _, result, picture = self._best
         packets, n = self._packets, self._summary.n
         counted = report.count_packets(n["received"], n["unsure"])
-        reason, advice = ("", "") if packets else split_message(result)
+        is_received = bool(packets or self._texts)
+        reason, advice = ("", "") if is_received else split_message(result)
         columns = [
             row | {"message": row["message"] and without_commands(row["message"])} for row in column_rows(result)
         ]
         return {
-            "status": result.status if not packets or result.status != "unreadable" else "partial",
-            "headline": capitalised(counted) if packets else report.headline(result),
+            "status": result.status if not is_received or result.status != "unreadable" else "partial",
+            "headline": capitalised(counted) if packets else "Received" if self._texts else report.headline(result),
             "reason": reason,
             "advice": advice,
             "mirrored": report.mirror_note(result),

@@ -271,3 +271,15 @@ def test_a_camera_is_not_kept_where_nothing_was_received(tmp_path: Path, capsys:
     assert "only the screen small was tried (--screen auto tries all)" in record["message"]
     assert "no packet was received with an estimated camera" in capsys.readouterr().err
     assert not profile.exists()
+
+
+def test_a_photo_of_less_than_a_packet_that_gives_its_text_is_a_success(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo = str(tmp_path / "fast.jpg")
+    sent = ["--screen", "data-17k3", "--text", "hello", "--readout", "5.1e-3", "--exposure-slots", "0.8"]
+    run(["simulate", photo, "--preset", "phone-plain", "--scale", "0.3", "--keep-readout", *sent])
+    assert run(["decode", photo, "--expect-text", "hello"]) == 0
+    heading = f"{photo} | ok | screen data-17k3 | camera unknown | "
+    assert capsys.readouterr().out.startswith(f"text: hello\n{heading}")
+    assert run(["inspect", photo, "--out", str(tmp_path / "page")]) == 0

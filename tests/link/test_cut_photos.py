@@ -10,7 +10,7 @@ from rxcli.lab.benchmark.goodput import detect
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.population import Population
 from rxcli.link import cut_photos, ldpc
-from rxcli.link.collector import Collector
+from rxcli.link.collector import Collector, PhotoCollector
 from rxcli.link.cut_photos import CutPhotos
 from rxcli.link.encoder import message
 from rxcli.link.placement import Placement
@@ -19,7 +19,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.receiver.decode.assemble import in_view
 from rxcli.receiver.decode.steady import is_steady
 from rxcli.receiver.receive import receive_frame
-from rxcli.types import BELIEVABLE, FrameSoftBits
+from rxcli.types import BELIEVABLE, ColumnResult, FrameResult, FrameSoftBits
 
 COLUMNS, SYMBOLS, TEXT = 20, 11, "Platform 4: the 10:42 leaves here"
 NO = Placement()
@@ -146,3 +146,17 @@ def test_a_picture_of_less_than_a_packet_gives_its_text(start_slot: float, state
     assert not any(packet.confidence >= BELIEVABLE for packet in result.packets)
     assert result.soft_bits.open_start == is_open
     assert [m.text for m in Collector(options.screens).add(result).messages] == ["hello there"]
+
+
+def test_a_photo_that_gives_its_text_is_received_from_the_screen_that_sends_texts() -> None:
+    """Whatever screen without packets it was taken for; the text names the photographs that were added up."""
+    collector, rng = PhotoCollector(ReceiverOptions().screens), np.random.default_rng(3)
+    column = ColumnResult(0, "no_packet", message="of 70 slots 27 are missing")
+    nothing = FrameResult("", 0, 0.0, "no_signal", "move closer", "paper-8k65", columns=(column,))
+    photos = [photo(range(k, k + 3), rng, number=k) for k in (1, 5)]
+    photos = [replace(soft, screen_profile="paper-17k3") for soft in photos]
+    first, second = (collector.add(replace(nothing, source=soft.source, soft_bits=soft)) for soft in photos)
+    assert (first.status, first.message) == ("no_signal", "move closer")
+    assert (second.status, second.message, second.screen_profile) == ("ok", None, "data-17k3")
+    assert second.columns == ()
+    assert [(message.text, message.photos) for message in second.messages] == [(TEXT, ("1", "5"))]

@@ -19,7 +19,7 @@ from rxcli.results.record import from_record, to_json_line, to_record
 from rxcli.results.report import format_frame, headline, printable_name
 from rxcli.results.summary import Limits, SourceSummary, exit_code, format_summary, write_junit, write_summary
 from rxcli.results.truth import Score
-from rxcli.types import ColumnResult, FrameResult, PacketResult
+from rxcli.types import ColumnResult, FrameResult, Message, PacketResult
 
 PACKET = PacketResult(412.6, 2.76, 168, "d076558cfe9de2d3cbb042f32dc440df474e5a5d9c", 0.998, 1.23e-5)
 OK = FrameResult(
@@ -166,6 +166,26 @@ def test_exit_codes() -> None:
         ([ok], Limits(max_ber=1.0), ExitCode.NOT_RECEIVED),
     ):
         assert exit_code(summaries, limits) is code, limits
+
+
+READ = Message("text", b"hello", "d.jpg", 0, 0.0, photos=("b.jpg", "d.jpg"))
+
+
+def test_a_text_is_a_success(tmp_path: Path) -> None:
+    """Also of the photo that shows a part of it, and another completes."""
+    photo = FrameResult("d.jpg", 0, 0.0, "ok", messages=(READ,))
+    text, part = summary(photo), summary(LOST)
+    part.add_part(READ)
+    assert exit_code([text, part], Limits(expected_texts=("hello",))) is ExitCode.OK
+    assert exit_code([text], Limits(expected_texts=("hello", "bye"))) is ExitCode.NOT_RECEIVED
+    assert exit_code([text], Limits(min_packets=2)) is ExitCode.NOT_RECEIVED
+    assert "completed by d.jpg" in format_summary([text, part], Limits())
+    assert format_summary([text, part], Limits()).endswith("all received")
+    write_junit(tmp_path / "j.xml", [text], Limits(expected_texts=("bye",)))
+    written = (tmp_path / "j.xml").read_text()
+    assert "the text 'bye' did not come" in written
+    assert "text: hello" in written
+    assert from_record(to_record(photo)) == photo
 
 
 def test_the_summary_names_reasons_and_scores() -> None:

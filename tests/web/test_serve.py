@@ -166,6 +166,15 @@ def test_photos_of_a_session_add_up(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "mine" not in sessions
 
 
+def test_a_photo_that_gives_its_text_without_a_packet_is_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = FrameResult("a", 0, 0.0, "ok", messages=(Message("text", b"hello", "a", 0, 0.0),))
+    monkeypatch.setattr("rxcli.runs.batch.Decoder.results", lambda *_: iter([read]))
+    answer = answer_for(tmp_path / "a.jpg", "a", receiver_options(soft_bits=True))
+    assert [answer[key] for key in ("status", "headline", "reason", "advice")] == ["ok", "Received", "", ""]
+
+
 def test_a_clip_is_answered_by_and_by() -> None:
     """What was received so far comes while the rest is read; at last the whole comes, as it does without."""
 

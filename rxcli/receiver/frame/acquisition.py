@@ -68,9 +68,5 @@ def distinct_screens(screens: Sequence[ScreenProfile]) -> list[ScreenProfile]:
 def variants_of(screen: ScreenProfile, screens: Sequence[ScreenProfile]) -> tuple[ScreenProfile, ...]:
     """The screen and its variants with other numbers of copies, the one with the most copies first."""
     candidates = reversed((screen, *screens))
-    by_repeats = {candidate.repeats: candidate for candidate in candidates if _shape(candidate) == _shape(screen)}
+    by_repeats = {candidate.repeats: candidate for candidate in candidates if candidate.packets == screen.packets}
     return tuple(by_repeats[repeats] for repeats in sorted(by_repeats, reverse=True))
-
-
-def _shape(screen: ScreenProfile) -> tuple[float, int, int]:
-    return screen.slot_rate_hz, screen.packet_slots, screen.columns

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel
 from rxcli.receiver.channel import denoise
@@ -161,11 +162,16 @@ def dark_columns(snr: Float32Array) -> NDArray[np.bool_]:
 
 
 def soft_bits(
-    frame: Frame, reception: Reception, no_header: NDArray[np.bool_], denoised: frozenset[int] = frozenset()
+    frame: Frame,
+    screen: ScreenProfile,
+    reception: Reception,
+    no_header: NDArray[np.bool_],
+    denoised: frozenset[int] = frozenset(),
 ) -> FrameSoftBits:
     """Soft bits of a photograph, including those of cut packets."""
     posteriors, n_observed = reception.posteriors, reception.n_observed
     features = reception.confidence_features(assume_unobserved_certain(posteriors, n_observed), denoised)
     snr_db = assemble.snr_db_of_columns(reception.snr)
     soft = still_soft_bits(posteriors, n_observed, features, snr_db, no_header)
+    soft = replace(soft, screen_profile=screen.name)
     return replace(soft, source=frame.source, frame=frame.index, time_s=frame.time_s)

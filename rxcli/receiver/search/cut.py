@@ -282,7 +282,7 @@ def _soft_bits(candidate: _Candidate) -> FrameSoftBits:
     if candidate.is_open:
         ways += [_of_common_weights(initial_pass(acquisition, share)) for share in SETTINGS.cut_room_lights[1:]]
     reception = decode(acquisition, _SKIP, max(ways, key=_n_certain), keeps_weights=True)
-    found = soft_bits(candidate.context.frame, reception, dark_columns(reception.snr))
+    found = soft_bits(candidate.context.frame, acquisition.screen, reception, dark_columns(reception.snr))
     return replace(found, open_start=candidate.is_open)
 
 
