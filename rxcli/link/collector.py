@@ -61,7 +61,7 @@ class Collector:
         if self._screen is not None and (events or result.packets):
             result = replace(result, screen_profile=self._screen)
         if events and result.status in ("no_signal", "no_screen"):  # what held no packet was a part of them
-            result = replace(result, status="ok", message=None, columns=(), skipped={})
+            result = replace(result, status="ok", remarks=(), message=None, columns=(), skipped={})
         return with_events(result, events)
 
     def _sender(self, name: str | None) -> str | None:
