@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
+from html import escape
 from typing import Any, Literal, Protocol, Self
 
 import numpy as np
@@ -397,7 +398,7 @@ class PacketResult:
     #: Frames of the clip in which the burst was seen; None for stills.
     frames: tuple[int, ...] | None = None
     #: Features of the confidence, see `rxcli.receiver.decode.confidence`; for fits, not for reports.
-    confidence_features: tuple[float, ...] = ()
+    confidence_features: tuple[float, ...] = field(default=(), repr=False)
 
     @property
     def is_believable(self) -> bool:
@@ -607,6 +608,22 @@ class FrameResult:
     remarks: tuple[Remark, ...] = ()
     #: Whether the decoding process was killed; a resumed run then decodes the source again.
     retry: bool = False
+
+    def __repr__(self) -> str:
+        """The result in a line: the rest is in its fields."""
+        names = ("source", "frame", "time_s", "status", "message", "screen_profile", "camera_profile")
+        known = [f"{name}={value!r}" for name in names if (value := getattr(self, name)) is not None]
+        came = [message.text or message.data for message in self.messages] + [file.name for file in self.objects]
+        n_packets = f"{len(self.packets)} packets of {len(self.columns)} columns"
+        return f"FrameResult({', '.join([*known, n_packets, *map(repr, came)])})"
+
+    def _repr_html_(self) -> str:
+        """Texts and packets as a notebook shows them."""
+        rows = [(c.column, c.w, f"{p.confidence:.4f}", p.payload) for c in self.columns for p in c.packets]
+        cells = ["".join(f"<td>{cell}</td>" for cell in row) for row in rows]
+        head = "".join(f"<th>{name}</th>" for name in ("column", "w", "confidence", "payload"))
+        table = "".join(f"<tr>{row}</tr>" for row in (head, *cells)) if rows else ""
+        return f"<p>{escape(repr(self))}</p><table>{table}</table>"
 
     @property
     def packets(self) -> tuple[PacketResult, ...]:

@@ -204,9 +204,36 @@ def test_other_arguments_that_are_none_are_refused(call: Callable[[], object]) -
 
 def test_arrays_without_a_screen_are_numbered_and_have_no_taps() -> None:
     dark = np.zeros((60, 80), np.uint8)
-    assert [result.frame for result in KNOWN.receive([dark] * 3)] == [0, 1, 2]
+    results = list(KNOWN.receive([dark] * 3, frame_rate=50))
+    assert [(result.frame, result.time_s) for result in results] == [(0, 0.0), (1, 0.02), (2, 0.04)]
     result, taps = KNOWN.tap(dark)
     assert (result.status, taps) == ("no_screen", None)
+
+
+@pytest.mark.parametrize("pictures", [[GREY] * 3, [rxcli.Frame(GREY, "mine")] * 3])
+def test_several_pictures_without_times_are_refused(pictures: Any) -> None:
+    """As a clip of frames at one instant would be received: hardly, and silently."""
+    with pytest.raises(rxcli.UsageError, match="have no times") as caught:
+        list(KNOWN.receive(pictures))
+    assert "frame_rate" in (caught.value.hint or "")
+    with pytest.raises(rxcli.UsageError, match="frame_rate must be above 0"):
+        KNOWN.receive(pictures, frame_rate=0)
+
+
+def test_an_option_that_there_is_not_is_named_with_the_one_that_was_meant() -> None:
+    with pytest.raises(rxcli.UsageError, match="no option 'screen'") as caught:
+        rxcli.decode(GREY, screen="paper-17k3")
+    assert "'screens'" in (caught.value.hint or "")
+
+
+def test_a_result_is_shown_in_a_line_and_in_notebooks_as_a_table(tapped: tuple[rxcli.FrameResult, Any]) -> None:
+    result = replace(tapped[0], source="<b>.dng")
+    assert len(repr(result)) < 200
+    assert "20 packets of 20 columns" in repr(result)
+    shown = result._repr_html_()
+    assert shown.count("<tr>") == 21
+    assert "<b>" not in shown
+    assert all(payload in shown for payload in payloads(result))
 
 
 def test_taps_that_are_none_are_refused(tmp_path: Path) -> None:

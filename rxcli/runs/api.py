@@ -1,8 +1,11 @@
 """What `import rxcli` calls: one source, received by a function."""
 
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
+from difflib import get_close_matches
+from inspect import signature
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -36,6 +39,11 @@ class Receiver:
     """
 
     def __init__(self, **options: Any) -> None:
+        known = signature(receiver_options).parameters
+        for name in options.keys() - known.keys():
+            like = get_close_matches(name, known, 1)
+            step = f"did you mean {like[0]!r}?" if like else f"options are {', '.join(known)}"
+            raise UsageError(f"there is no option {name!r}", step)
         self.options = receiver_options(**{"soft_bits": True, **options})
 
     def decode(self, picture: Picture) -> FrameResult:
@@ -56,25 +64,26 @@ class Receiver:
         (result,) = self._with_messages(iter([receive_frame(_frame_of(picture), self.options, on_taps)]))
         return result
 
-    def receive(self, source: str | Path | Iterable[Picture]) -> Iterator[FrameResult]:
+    def receive(self, source: str | Path | Iterable[Picture], frame_rate: float | None = None) -> Iterator[FrameResult]:
         """Receive a clip, a device, a photograph, or frames in order of time; one result a frame, in order.
 
         Results are delayed by some frames, because later frames improve earlier ones. A packet is reported in the last
         frame that shows it.
 
         Args:
-            source: path of a file or V4L2 device; or arrays or `Frame`s of one camera. Give `Frame`s with `index` and
-                `time_s` where the frame rate matters, as it does for bursts that several frames show.
+            source: path of a file or V4L2 device; or arrays or `Frame`s of one camera.
+            frame_rate: frames per second of arrays, or of `Frame`s without `time_s`.
 
         Raises:
             InputError: the file cannot be read, or, after the results before the break, it breaks off.
-            UsageError: an array is no picture, or a frame is impossible.
+            UsageError: an array is no picture, a frame is impossible, or there are several without times.
         """
+        check_values(("frame_rate", frame_rate, frame_rate is None or is_number(frame_rate, 1e-3), "above 0"))
         several = isinstance(source, Iterable) and not (isinstance(source, np.ndarray) and source.ndim < 3)
         if not several and not isinstance(source, Path):
             reason = f"what is received must be a path, or several pictures (got {type(source).__name__})"
             raise UsageError(reason, "give a path or a list of pictures; use decode for one picture")
-        frames = open_source(source) if isinstance(source, (str, Path)) else _numbered(source)
+        frames = open_source(source) if isinstance(source, (str, Path)) else _numbered(source, frame_rate)
         return self._with_messages(receive_frames(frames, self.options, taps_writer(self.options.dump_dir)))
 
     def _with_messages(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
@@ -101,9 +110,11 @@ def decode(picture: Picture, **options: Any) -> FrameResult:
     return Receiver(**options).decode(picture)
 
 
-def receive(source: str | Path | Iterable[Picture], **options: Any) -> Iterator[FrameResult]:
-    """Receive a clip, a device, or frames in order of time: `Receiver(**options).receive(source)`."""
-    return Receiver(**options).receive(source)
+def receive(
+    source: str | Path | Iterable[Picture], frame_rate: float | None = None, **options: Any
+) -> Iterator[FrameResult]:
+    """Receive a clip, a device, or frames in order of time: `Receiver(**options).receive(source, frame_rate)`."""
+    return Receiver(**options).receive(source, frame_rate)
 
 
 def tap(picture: Picture, **options: Any) -> tuple[FrameResult, Taps | None]:
@@ -177,7 +188,15 @@ def _check_frame(frame: Frame) -> None:
         check_values((f"{of} and white", pair, are_right, "numbers, white above black"))
 
 
-def _numbered(pictures: Iterable[Picture]) -> Iterator[Frame]:
+def _numbered(pictures: Iterable[Picture], frame_rate: float | None) -> Iterator[Frame]:
+    """Frames at their own times, or at those of a frame rate."""
+    first_s = math.nan
     for number, picture in enumerate(pictures):
         frame = _frame_of(picture)
-        yield frame if isinstance(picture, Frame) else replace(frame, index=number)
+        if frame_rate is not None or not isinstance(picture, Frame):
+            frame = replace(frame, index=number, time_s=number / frame_rate if frame_rate else frame.time_s)
+        if number == 1 and frame.time_s == first_s:
+            reason = "the pictures have no times, which burst each shows is not known"
+            raise UsageError(reason, "give frame_rate=, in frames a second, or Frames with time_s")
+        first_s = frame.time_s if number == 0 else first_s
+        yield frame
