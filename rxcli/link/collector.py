@@ -65,10 +65,10 @@ class Collector:
         return with_events(result, events)
 
     def _sender(self, name: str | None) -> str | None:
-        """The screen that sends texts in the packets of another: of those alike the one with the fewest copies."""
+        """The screen that sends texts in the packets of the named one: the one with the fewest copies."""
         packets = [screen.packets for screen in self._screens if screen.name == name]
-        alike = [screen for screen in self._screens if screen.packets in packets]
-        return min(alike, key=lambda screen: screen.repeats).name if alike else None
+        senders = [screen for screen in self._screens if screen.packets in packets]
+        return min(senders, key=lambda screen: screen.repeats).name if senders else None
 
     def finish(self, last: FrameResult) -> FrameResult:
         """Add the remaining messages and files, complete or not, to the last result of the source."""
