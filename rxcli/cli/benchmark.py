@@ -6,14 +6,15 @@ from typing import Any
 import click
 import msgspec
 
-from rxcli.cli.common import options
+from rxcli.cli.common import field_table, options
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.cli.kinds import FOLDER
 from rxcli.errors import ExitCode
 from rxcli.lab.benchmark import compare as checkouts
 from rxcli.lab.benchmark import measures, tables
 from rxcli.lab.benchmark import quick as headline
-from rxcli.lab.benchmark.cases import OTHER_KERNEL, WAYS
+from rxcli.lab.benchmark.cases import OTHER_KERNEL, TWIN, WAYS
+from rxcli.lab.benchmark.draw import People
 from rxcli.lab.benchmark.runner import Run, Scenario, capture_points, load_journal, scenarios
 from rxcli.outputs import claim_own_folder, write_whole
 
@@ -25,6 +26,7 @@ _SEED = ("--seed", click.IntRange(0, 10**6), 0, "Of all random scenes.")
 _COUNTED = ("--count", _COUNT, None, "Numbers to draw at each point.  [default: the scenario's]")
 _CAPTURES = ("--folder captures", _FOLDER, None, "Of `captures` and `files`: where they lie.  [default: the samples]")
 _ONLY = ("--only", [str], None, "A point of the scenario; may be given several times.")
+_SET = ("--set fields", [str], None, "A field of every point, as exposure_slots=[3,6]; may be given several times.")
 _QUIET = ("--quiet", None, False, "No progress bar.")
 _RUN = (("--jobs", click.IntRange(1, 256), 1, "Processes, one thread each."), _OUT, _SEED, _QUIET)
 
@@ -39,7 +41,7 @@ class _Scenarios(SuggestingGroup):
         if name not in scenarios():
             return super().get_command(context, name)
         command = click.pass_context(_run_scenario)
-        for row in (_COUNTED, _CAPTURES, _ONLY, *_RECEPTION, *_RUN):
+        for row in (_COUNTED, _CAPTURES, _ONLY, _SET, *_RECEPTION, *_RUN):
             command = options(row)(command)
         return click.command(name, help=scenarios()[name].about, short_help=scenarios()[name].about)(command)
 
@@ -58,15 +60,24 @@ def _begin(name: str, out: Path, jobs: int, quiet: bool) -> Run:
     return Run(out / f"{name}.journal.jsonl", jobs, quiet)
 
 
-def _chosen(name: str, captures: Path | None, only: tuple[str, ...], ways: tuple[str, ...] = ()) -> Scenario:
-    """The scenario of this name, with the points and ways that were asked for."""
+def _chosen(
+    name: str, captures: Path | None, only: tuple[str, ...], fields: tuple[str, ...] = (), ways: tuple[str, ...] = ()
+) -> Scenario:
+    """The scenario of this name, with the points, their fields and the ways that were asked for."""
     scenario = scenarios()[name]
     points = capture_points(captures) if scenario.draw == "capture" else scenario.points
-    for known, asked in ((points, only), ((*WAYS, OTHER_KERNEL), ways)):
+    for known, asked in ((points, only), ((*WAYS, OTHER_KERNEL, TWIN), ways)):
         for choice in asked:
             if choice not in known:
                 raise click.BadParameter(f"{choice!r} is not one of {', '.join(known)}")
-    points = {label: point for label, point in points.items() if not only or label in only}
+    fixed = {name: value for text in fields for name, value in field_table(text).items()}
+    points = {label: point | fixed for label, point in points.items() if not only or label in only}
+    if fixed and scenario.draw != "people":
+        raise click.BadParameter(f"{name} draws no population: its fields are fixed", param_hint="--set")
+    try:
+        _ = [msgspec.convert(scenario.base | point, People) for point in points.values() if fixed]
+    except msgspec.ValidationError as error:
+        raise click.BadParameter(str(error), param_hint="--set") from None
     ways = ways or scenario.ways
     beside = scenario.beside if scenario.beside in ways else None
     return msgspec.structs.replace(scenario, points=points, ways=ways, beside=beside)
@@ -74,7 +85,7 @@ def _chosen(name: str, captures: Path | None, only: tuple[str, ...], ways: tuple
 
 def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given: Any) -> int:
     name, out = str(context.info_name), given["out"]
-    scenario = _chosen(name, given["captures"], given["only"], given["ways"])
+    scenario = _chosen(name, given["captures"], given["only"], given["fields"], given["ways"])
     run = _begin(name, out, given["jobs"], given["quiet"])
     more = {"save": str(given["save"])} if given["save"] else {}
     count = given["count"] or scenario.count

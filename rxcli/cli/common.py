@@ -143,3 +143,16 @@ def write_json(value: Any, path: str | None) -> None:
         click.echo(text)
     else:
         write_whole(Path(path), text + "\n")
+
+
+def field_table(text: str) -> dict[str, Any]:
+    """FIELD=VALUE as a table of TOML; a text needs no quotes."""
+    import tomllib
+
+    name, _, value = text.partition("=")
+    for toml in (value, json.dumps(value)):
+        try:
+            return tomllib.loads(f"{name} = {toml}")
+        except tomllib.TOMLDecodeError:
+            continue
+    raise UsageError(f"--set {text}: not FIELD=VALUE", "name a field and its value, as in isp.quality=85")

@@ -1,7 +1,5 @@
 """`vlc-rx simulate`: captures with truth."""
 
-import json
-import tomllib
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
@@ -13,7 +11,7 @@ import click
 import numpy as np
 
 from rxcli import outputs
-from rxcli.cli.common import force_argument, options, output
+from rxcli.cli.common import field_table, force_argument, options, output
 from rxcli.cli.kinds import FILE, FOLDER, POSITIVE, Exposure
 from rxcli.cli.printing import with_progress
 from rxcli.cli.sending import payload_bytes, sending_of
@@ -129,7 +127,7 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
     """The preset with what the options change."""
     scene = preset(options["preset"], options["screen"])
     for text in options["fields"]:
-        scene = with_fields(scene, _table(text))
+        scene = with_fields(scene, field_table(text))
     sent, given = _sent(options, scene.screen), _given(options, _SCENE_OPTIONS)
     scene = replace(scene, w=_weights(options["weights"]), **sent, **given)
     scene = replace(scene, film=replace(scene.film, shows=options["film"] or scene.film.shows))
@@ -158,17 +156,6 @@ def _sent(options: dict[str, Any], screen: ScreenProfile) -> dict[str, Any]:
     if given:
         return {"labels": sending_of(options["file_path"], options["text"], options["uri"])}
     return {"payload": payload_bytes(options["payload"])}
-
-
-def _table(text: str) -> dict[str, Any]:
-    """FIELD=VALUE as a table of TOML; a text needs no quotes."""
-    name, _, value = text.partition("=")
-    for toml in (value, json.dumps(value)):
-        try:
-            return tomllib.loads(f"{name} = {toml}")
-        except tomllib.TOMLDecodeError:
-            continue
-    raise UsageError(f"--set {text}: not FIELD=VALUE", "name a field of the preset, as in isp.quality=85")
 
 
 def _for_format(scene: Scene, file_format: str) -> Scene:

@@ -392,12 +392,28 @@ def test_a_way_alone_is_compared_with_none(tmp_path: Path) -> None:
         (["phones", "--way", "nope"], "is not one of receiver"),
         (["compare", ".", "nope"], "is no scenario"),
         (["--quick", "confidence"], "stands alone"),
+        (["films", "--set", "exposure_slots=nope"], "exposure_slots"),
+        (["films", "--set", 'films=["nope"]'], "films"),
+        (["films", "--set", "?"], "not FIELD=VALUE"),
+        (["speed", "--set", "n_frames=3"], "draws no population"),
     ],
 )
 def test_mistakes_are_told(arguments: list[str], message: str) -> None:
     result = CliRunner().invoke(benchmark, arguments)
-    assert result.exit_code == 2
-    assert message in result.output
+    assert result.exit_code == 2 or isinstance(result.exception, UsageError)
+    assert message in result.output + str(result.exception)
+
+
+def test_films_twins_and_photographs_stand_in_one_table(tmp_path: Path) -> None:
+    small = ["width_px=[480,480]", "rows=[0.25,0.25]", "n_frames=2", "exposure_slots=[1,1]", 'screens=["paper-8k65"]']
+    arguments = ["films", "--only", "pan", "--count", "1", "--seed", "3", "--quiet", "--out", str(tmp_path / "out")]
+    arguments += [part for field in small for part in ("--set", field)]
+    assert CliRunner().invoke(benchmark, [*arguments, "--save", str(tmp_path / "saved")]).exit_code in (0, None)
+    rows = json.loads((tmp_path / "out" / "films.json").read_text())["rows"]
+    assert [row["way"] for row in rows if row["scenes"] == "up to 1.5 slots"] == ["receiver", "twin", "photographs"]
+    assert all(row["problems"] == 0 for row in rows)
+    names = {path.name for path in (tmp_path / "saved").glob("*.mp4")}
+    assert names == {"pan-3-0-0.mp4", "pan-3-0-0-twin.mp4"}
 
 
 # Two checkouts.

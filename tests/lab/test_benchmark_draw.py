@@ -14,6 +14,7 @@ from rxcli.lab.benchmark.draw import DRAWERS, Place
 from rxcli.lab.benchmark.measures import MEASURES
 from rxcli.lab.benchmark.media import Medium
 from rxcli.lab.benchmark.runner import scenarios
+from rxcli.lab.simulate.capture import warped
 from rxcli.lab.simulate.files import Encoding
 from rxcli.lab.simulate.no_data import EVEN_KINDS, STRIPED_KINDS
 from rxcli.lab.simulate.optics import View
@@ -25,7 +26,7 @@ from rxcli.lab.simulate.scenes import preset
 def test_every_row_of_the_table_names_what_there_is() -> None:
     for name, scenario in scenarios().items():
         assert scenario.draw in {*DRAWERS, "transfer"}, name
-        assert set(scenario.ways) <= {*WAYS, "another kernel"}, name
+        assert set(scenario.ways) <= {*WAYS, "another kernel", "twin"}, name
         assert set(scenario.all_columns) <= MEASURES.keys(), name
         assert scenario.beside is None or scenario.beside in scenario.ways, name
 
@@ -105,9 +106,8 @@ def test_every_other_picture_without_data_is_striped(tmp_path: Path) -> None:
 
 def test_files_of_captures_go_away(tmp_path: Path) -> None:
     small = preset("video-1080p", "paper-8k65").scaled(0.2, 0.2, keep_readout=True)
-    with draw.recorded(
-        replace(small, n_frames=2), Place(0, 44, {}, tmp_path), encoding=Encoding("hevc", 10**6)
-    ) as case:
+    recording = draw.prepare(replace(small, n_frames=2), 44)
+    with draw.recorded(recording, Place(0, 44, {}, tmp_path), encoding=Encoding("hevc", 10**6)) as case:
         (path,) = case.source
         assert isinstance(path, Path)
         assert path.stat().st_size > 1000
@@ -127,7 +127,8 @@ def test_rows_are_moved_smoothly_and_no_further_than_said() -> None:
     ramp = np.add.outer(np.arange(200), np.arange(300)).astype(np.uint16) * 10  # a pixel either way is ten levels
     moves = []
     for seed in range(20):
-        pixels = draw.warped(ramp, np.random.default_rng(seed), 6.0).astype(np.float64)
+        share = (6 / 300, 0.0) if seed % 2 else (0.0, 6 / 200)
+        pixels = warped(ramp, np.random.default_rng(seed), share).astype(np.float64)
         moved = (pixels - ramp)[10:-10, 10:-10] / 10
         assert np.ptp(moved, axis=1).max() <= 0.2  # rows keep their shape
         assert np.abs(np.diff(moved[:, 0])).max() < 0.6
@@ -157,3 +158,39 @@ def test_the_payload_comes_again_with_the_first_frame_of_a_clip(name: str) -> No
     bits = {"paper-8k65": 35, "paper-17k3": 77, "paper-34k6": 168}[medium.screen] * 20 * round(bursts)
     assert len(scene.payload) == bits // 8
     assert scene.sensor.width % 2 == scene.sensor.height % 2 == 0
+
+
+def test_a_film_and_a_tilt_have_twins(tmp_path: Path) -> None:
+    """The twin sends the same to an upright camera before a picture at rest, under the same options."""
+    small = {"cameras": ["video-1080p"], "screens": ["paper-17k3"], "width_px": [384, 384], "rows": [0.2, 0.2]}
+    film = {**small, "films": ["cut"], "n_frames": 2}
+    tilt = {**small, "tilt_deg": [30.0, 0.0, 0.0]}
+    for point, is_photo in ((film, False), (tilt, True)):
+        with_twin = next(draw.draw_people(Place(3, 1, point, tmp_path, twin=True)))
+        alone = next(draw.draw_people(Place(3, 1, point, tmp_path)))
+        assert alone.twin is None
+        twin = with_twin.twin
+        assert twin is not None
+        assert twin.truth is not None
+        assert with_twin.truth is not None
+        assert (len(twin.trials) == 1) == is_photo
+        assert twin.options == with_twin.options
+        common = twin.truth.payload.keys() & with_twin.truth.payload.keys()
+        assert common
+        assert all(twin.truth.payload[burst] == with_twin.truth.payload[burst] for burst in common)
+        corners, upright = with_twin.corners, twin.corners
+        assert corners is not None
+        assert upright is not None
+        lean = np.degrees(np.arctan2(*(corners[1] - corners[0])[::-1])) % 180
+        lean_of_twin = np.degrees(np.arctan2(*(upright[1] - upright[0])[::-1])) % 180
+        assert abs((lean - lean_of_twin + 90) % 180 - 90) == pytest.approx(30 if is_photo else 0, abs=3)
+
+
+def test_tilted_screens_stay_in_view_and_zero_tilt_draws_as_before() -> None:
+    tilted = Population(tilt_deg=(50.0, 30.0, 30.0), tilt_share=(0.0, 1.0))
+    for number in range(8):
+        scene, _ = tilted.draw(np.random.default_rng(number))
+        sensor = scene.sensor
+        corners = View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect).corners
+        assert (corners > -1).all()
+        assert (corners < [sensor.width, sensor.height]).all()

@@ -71,11 +71,11 @@ def test_a_tear_runs_where_the_panel_is_written() -> None:
     assert torn
 
 
-def test_the_twin_at_rest_has_the_same_payloads_noise_and_camera() -> None:
+def test_the_twin_plain_has_the_same_payloads_noise_and_camera() -> None:
     take = prepare(scene_of("pan:3,1", hand_px=2.0), 7)
-    rest, film = take.at_rest.truth("clip"), take.truth("clip")
+    rest, film = take.plain.truth("clip"), take.truth("clip")
     assert rest == film
-    still = take.at_rest
+    still = take.plain
     pictures = [recording.frame(2).rgb.astype(float) for recording in (take, still)]
     assert np.abs(pictures[0] - pictures[1]).mean() > 2
     # It is the simulator without any film.
@@ -136,3 +136,17 @@ def test_what_is_no_film_is_refused(shows: str) -> None:
         Film(shows)
     with pytest.raises(UsageError, match="content_hz must be positive"):
         Film("pan:1", content_hz=0)
+
+
+def test_a_camera_mixes_frames_over_time_and_moves_their_rows() -> None:
+    plain = scene_of("", picture="chelsea")
+    ways: list[dict[str, Any]] = [{}, {"averaged": 0.4}, {"averaged": 0.4, "averages_again": True}]
+    takes = [prepare(replace(plain, **fields), 5) for fields in ways]
+    frames, mixed, recursive = ([picture.astype(float) for picture in take.pictures()] for take in takes)
+    assert np.array_equal(mixed[0], frames[0])
+    assert mixed[2] == pytest.approx(0.6 * frames[2] + 0.4 * frames[1], abs=0.51)
+    assert recursive[2] == pytest.approx(0.6 * frames[2] + 0.4 * recursive[1], abs=0.51)
+    moved = prepare(replace(plain, warp=(0.02, 0.0)), 5)
+    assert [np.abs(moved.frame(n).rgb - frames[n]).mean() > 2 for n in range(2)] == [True, True]
+    assert np.array_equal(moved.frame(1).rgb, moved.frame(1).rgb)
+    assert np.array_equal(moved.plain.frame(1).rgb, frames[1])

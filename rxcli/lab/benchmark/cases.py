@@ -28,7 +28,8 @@ from rxcli.link.collector import Collector, PhotoCollector
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.outputs import write_whole
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile
-from rxcli.receiver.receive import receive
+from rxcli.receiver.receive import receive, receive_frame
+from rxcli.results.cameras import estimated_camera
 from rxcli.results.record import from_record
 from rxcli.results.truth import Scorer, Truth, truth_path
 from rxcli.runs.processes import ONE_THREAD, environment, peak_memory_mb, start_process
@@ -71,17 +72,20 @@ class Case:
     text: str | None = None
     #: The simulated photographs, for the bound and the paper's pipeline.
     trials: tuple[Trial, ...] = ()
+    #: The same without what is measured: its picture at rest, its camera upright and plain.
+    twin: "Case | None" = None
 
     def receive(
         self, options: ReceiverOptions, changed: Callable[[Frame], Frame] | None = None
     ) -> Iterator[FrameResult]:
         """The results of all sources, photographs numbered as the frames of a clip."""
-        sources = self._sources()
+        sources = self.sources()
         for number, frames in enumerate(sources):
             for result in receive(map(changed, frames) if changed else frames, options):
                 yield result if len(sources) == 1 else replace(result, frame=number)
 
-    def _sources(self) -> list[Iterable[Frame]]:
+    def sources(self) -> list[Iterable[Frame]]:
+        """The frames of every source."""
         files = [open_source(source) for source in self.source if isinstance(source, Path)]
         return list(files) or [[source for source in self.source if isinstance(source, Frame)]]
 
@@ -124,6 +128,16 @@ def _on_two_threads(case: Case) -> Iterator[FrameResult]:
         yield from case.receive(case.options)
 
 
+def _as_photographs(case: Case) -> Iterator[FrameResult]:
+    """Every frame of a clip alone, with the camera of the first one that shows it, as by --same-camera."""
+    options = case.options
+    for frame in case.sources()[0]:
+        yield (result := receive_frame(frame, options))
+        if options is case.options and result.gives_camera:
+            camera = estimated_camera(frame, result, "same-camera")
+            options = replace(options, cameras=(camera,), force_camera=True)
+
+
 def _by_command(case: Case) -> Iterator[FrameResult]:
     """By `vlc-rx decode` in a process of its own: what a user waits for, start-up included."""
     paths = [path for path in case.source if isinstance(path, Path)]
@@ -132,12 +146,13 @@ def _by_command(case: Case) -> Iterator[FrameResult]:
     yield from (from_record(json.loads(line)) for line in done.stdout.splitlines())
 
 
-RECEIVER, OTHER_KERNEL = "receiver", "another kernel"
-#: Name of a way -> how it receives a case. `OTHER_KERNEL` is `RECEIVER` in another process.
+RECEIVER, OTHER_KERNEL, TWIN = "receiver", "another kernel", "twin"
+#: Name of a way -> how it receives a case. `OTHER_KERNEL` is `RECEIVER` in another process, `TWIN` of the twin.
 WAYS: dict[str, Way] = {
     RECEIVER: _with_options(),
     "corners given": lambda case: case.receive(replace(case.options, corners=case.corners)),
     "camera and corners given": lambda case: case.receive(case.named or case.options),
+    "photographs": _as_photographs,
     "frames one by one": _with_options(skip=frozenset(SKIPS) - {"tracking"}),
     "searched": _with_options(corners=None),
     "no auto-encoder": _with_options(cae="never"),
@@ -177,6 +192,9 @@ def received(case: Case, way: str) -> Record:
 
     An exception is a finding here: it stands in the record like a warning and NaN in a result.
     """
+    if way == TWIN:
+        assert case.twin is not None, "drawn where this way is asked for"
+        return received(case.twin, RECEIVER)
     if way == OTHER_KERNEL:
         # A trial stays here: its simulation is large, and no receiver looks at it.
         _other_kernel().send(replace(case, trials=()))

@@ -2,24 +2,23 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from math import sqrt
+from functools import partial
+from math import inf, sqrt
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from rxcli.lab.benchmark.cases import Case
 from rxcli.lab.benchmark.media import Medium, camera_path
 from rxcli.lab.benchmark.trial import Trial, known_camera, known_corners, write_still
-from rxcli.lab.simulate.capture import prepare
-from rxcli.lab.simulate.files import Encoding, encode_jpeg, write_video
+from rxcli.lab.simulate.capture import Recording, prepare
+from rxcli.lab.simulate.files import Encoding, write_video
 from rxcli.lab.simulate.no_data import STRIPED_KINDS, draw_kind, no_data_scene
 from rxcli.lab.simulate.pictures import DARK_KINDS
 from rxcli.lab.simulate.population import Population, Range, log_uniform
@@ -43,8 +42,9 @@ class Place:
     point: Mapping[str, Any]
     #: Where files that are made once are kept.
     folder: Path
-    #: Whether to record what the bound needs.
+    #: Whether to record what the bound needs, and whether to draw the twin of every case.
     oracle: bool = False
+    twin: bool = False
 
     @property
     def flat(self) -> int:
@@ -58,6 +58,8 @@ class Place:
 _PHOTOS_HZ = 0.4
 _LETTERS = tuple("abcdefghijklmnopqrstuvwxyz 0123456789")
 _ENCODING = Encoding("h264", 8_000_000)
+#: Rows of the table that pairs of a case and its twin are counted in, by exposure in slots.
+_EXPOSURES = {"up to 1.5 slots": (0.0, 1.5), "1.5 to 3 slots": (1.5, 3.0), "3 slots and more": (3.0, inf)}
 
 
 class People(Population, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -69,8 +71,6 @@ class People(Population, frozen=True, kw_only=True, forbid_unknown_fields=True):
     text_bytes: int = 0
     #: Whether screen, camera and corners are named to the receiver.
     named: bool = False
-    #: By how much software moves the rows of photographs, at most.
-    warped_px: float = 0.0
     #: Encoders of clips, how hard they work, and bits per pixel and frame.
     codecs: tuple[str, ...] = ("h264",)
     efforts: tuple[str, ...] = ("veryfast",)
@@ -85,55 +85,52 @@ class People(Population, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 def draw_people(at: Place) -> Iterator[Case]:
     """Files of a population, their camera unknown; point: fields of `People`."""
-    people, rng = msgspec.convert(at.point, People), np.random.default_rng([at.seed, at.number, 31])
+    people = msgspec.convert(at.point, People)
+    upright, rng = (np.random.default_rng([at.seed, at.number, 31]) for _ in range(2))
     scene, kind = people.draw(rng)
     text = "".join(rng.choice(_LETTERS, people.text_bytes)) if people.text_bytes else None
     if text is not None:
         scene = replace(scene, labels=message(text), start_slot=rng.uniform(0, 1e5), w=5)
-    groups = ("dark", kind) if kind in DARK_KINDS else ("bright",)
-    about = {"kind": kind, "exposure_slots": scene.exposure_s * scene.screen.slot_rate_hz}
+    if people.photos > 1:
+        scene = replace(scene, n_frames=people.photos, frame_rate_hz=_PHOTOS_HZ)
+    exposure_slots, encoding = scene.exposure_s * scene.screen.slot_rate_hz, people.encoding(scene, rng)
+    groups: tuple[str, ...] = ("dark", kind) if kind in DARK_KINDS else ("bright",)
+    groups += tuple(name for name, (low, high) in _EXPOSURES.items() if at.twin and low < exposure_slots <= high)
+    about = {"kind": kind, "film": scene.film.shows, "exposure_slots": exposure_slots}
     about["readout_ms"] = 1e3 * scene.sensor.line_delay_s * scene.sensor.height
-    with recorded(scene, at, people.photos, people.encoding(scene, rng)) as case:
-        for path, trial in zip(case.source, case.trials, strict=False):
-            if people.warped_px and isinstance(path, Path) and not scene.is_mosaic:
-                path.write_bytes(encode_jpeg(warped(trial.capture.rgb, rng, people.warped_px), scene))
+
+    def unnamed(case: Case, twin: Case | None = None) -> Case:
         named = replace(case.options, soft_bits=text is not None)
         options = named if people.named else ReceiverOptions(soft_bits=text is not None)
-        yield replace(case, options=options, named=named, groups=groups, about=case.about | about, text=text)
+        known: dict[str, Any] = {"groups": groups, "about": case.about | about, "text": text, "twin": twin}
+        return replace(case, options=options, named=named, **known)
+
+    plain = msgspec.structs.replace(people, tilt_deg=(0.0,) * 3).draw(upright)[0] if at.twin else scene
+    twin = prepare(replace(scene, pose=plain.pose), at.flat).plain
+    files = partial(recorded, at=at, encoding=encoding, photos=people.n_frames == 1)
+    with files(prepare(scene, at.flat)) as case, files(twin) if at.twin else nullcontext() as twin_case:
+        yield unnamed(case, twin_case and unnamed(twin_case))
 
 
 @contextmanager
-def recorded(scene: Scene, at: Place, photos: int = 1, encoding: Encoding = _ENCODING) -> Iterator[Case]:
-    """A scene as files in a folder that goes away afterwards; screen, camera and corners are named to the receiver."""
-    if scene.n_frames == 1 < photos:
-        scene = replace(scene, frame_rate_hz=_PHOTOS_HZ)
-    recording = prepare(replace(scene, n_frames=max(scene.n_frames, photos)), at.flat)
-    exposure, whole = recording.exposure(), recording.truth("drawn")
-    frames = (recording.frame(n, oracle=at.oracle, threads=1) for n in range(recording.scene.n_frames))
+def recorded(
+    recording: Recording, at: Place, encoding: Encoding = _ENCODING, *, photos: bool = False
+) -> Iterator[Case]:
+    """A recording as files in a folder that goes away; screen, camera and corners are named to the receiver."""
+    scene, exposure, whole = recording.scene, recording.exposure(), recording.truth("drawn")
+    photos = photos or scene.n_frames == 1
     with TemporaryDirectory() as folder:
-        trials = [] if scene.n_frames > 1 else [Trial(frame, frame.frame) for frame in frames]
+        frames = (recording.frame(n, oracle=at.oracle, threads=1) for n in range(scene.n_frames if photos else 0))
+        trials = [Trial(frame, frame.frame) for frame in frames]
         paths = [write_still(trial.capture, Path(folder) / str(trial.index)) for trial in trials]
-        if not trials:
+        if not photos:
             paths = [Path(folder) / "0.mp4"]
-            write_video((frame.rgb for frame in frames), paths[0], encoding, scene.frame_rate_hz, scene.orientation)
+            write_video(recording.pictures(), paths[0], encoding, scene.frame_rate_hz, scene.orientation)
         about = {"screen": scene.screen.name, "camera": scene.camera_name, "rows_per_slot": scene.rows_per_slot}
         known: dict[str, Any] = {"truth": msgspec.convert(whole, Truth, str_keys=True), "whole_truth": whole}
         corners, cameras = known_corners(exposure), (known_camera(exposure),)
         named = ReceiverOptions(screens=(scene.screen,), cameras=cameras, force_camera=True, corners=corners)
         yield Case(source=tuple(paths), options=named, about=about, corners=corners, trials=tuple(trials), **known)
-
-
-def warped(pixels: NDArray[Any], rng: np.random.Generator, max_px: float) -> NDArray[Any]:
-    """A picture with its rows moved smoothly, across or along the readout, as software that straightens does."""
-    height, width = pixels.shape[:2]
-    y, x = np.mgrid[:height, :width].astype(np.float32)
-    knots = rng.uniform(-1, 1, int(rng.integers(3, 9)))
-    places = np.linspace(0, knots.size - 1, height)
-    smooth = np.interp(places, np.arange(knots.size), knots)
-    smooth = cv2.GaussianBlur(smooth[:, None], (1, 0), 0, sigmaY=height / (4 * knots.size))
-    moved = (smooth / np.abs(smooth).max() * rng.uniform(0, max_px)).astype(np.float32)
-    x, y = (x + moved, y) if rng.random() < 0.5 else (x, y + moved)
-    return np.asarray(cv2.remap(pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 # Pictures without data.
@@ -145,7 +142,7 @@ def draw_nodata(at: Place) -> Iterator[Case]:
     kind = draw_kind(rng, at.number % 2 == 0)
     scene, about = no_data_scene(kind, rng, at.point.get("n_frames", 1))
     groups = (kind, *(("striped",) if kind in STRIPED_KINDS else ()))
-    with recorded(scene, at) as case:
+    with recorded(prepare(scene, at.flat), at) as case:
         options = ReceiverOptions(cameras=case.options.cameras, force_camera=True)
         options = options if at.point.get("camera_named") else ReceiverOptions(cameras=())
         case = replace(case, options=options, about={"kind": kind, **about}, truth=None, whole_truth=None)
@@ -162,7 +159,7 @@ _PX_PER_COLUMN = 45.0
 
 def draw_point(at: Place) -> Iterator[Case]:
     """A frame of one place of a sweep, screen, camera and corners handed over; for the point see `scene_at`."""
-    with recorded(scene_at(**at.point), at) as case:
+    with recorded(prepare(scene_at(**at.point), at.flat), at) as case:
         yield case
 
 

@@ -15,7 +15,7 @@ import msgspec
 from rxcli.errors import InputError
 from rxcli.ingest import KNOWN_SUFFIXES
 from rxcli.lab.benchmark import goodput
-from rxcli.lab.benchmark.cases import Case, Record, arguments_of, bare, received, write_case
+from rxcli.lab.benchmark.cases import TWIN, Case, Record, arguments_of, bare, received, write_case
 from rxcli.lab.benchmark.draw import DRAWERS, Place
 from rxcli.lab.benchmark.measures import COMMON, COMMON_COST
 from rxcli.outputs import write_whole
@@ -86,19 +86,21 @@ def do(task: Task) -> list[Record]:
     if task["draw"] == "transfer":
         way = {"receiver": goodput.transferred(**task["point"], seed=(task["seed"], task["number"]))}
         return [{"about": {}, "has_data": True, "groups": [task["label"]], "ways": way}]
-    oracle = "bound" in task["ways"]
-    place = Place(task["seed"], task["number"], task["point"], Path(task["folder"]), oracle)
+    ways = task["ways"]
+    place = Place(task["seed"], task["number"], task["point"], Path(task["folder"]), "bound" in ways, TWIN in ways)
     records = []
     for turn, case in enumerate(DRAWERS[task["draw"]](place)):
         if task["cae"] is not None:
             case = replace(case, options=replace(case.options, cae=task["cae"]))
-        ways = {way: received(case, way) for way in task["ways"]}
+        found = {way: received(case, way) for way in ways}
         groups = [*filter(None, [task["label"]]), *case.groups]
         about = {"number": task["number"], **case.about}
         if task.get("save"):
             name = f"{task['label']} {task['seed']} {task['number']} {turn}".strip().replace(" ", "-")
-            save(case, Path(task["save"]) / name, {"about": about, "groups": groups, "ways": ways, "text": case.text})
-        records.append({"about": about, "has_data": case.has_data, "groups": groups, **bare(case), "ways": ways})
+            save(case, Path(task["save"]) / name, {"about": about, "groups": groups, "ways": found, "text": case.text})
+            if case.twin is not None:
+                save(case.twin, Path(task["save"]) / f"{name}-twin", {"about": about, "groups": groups, "ways": {}})
+        records.append({"about": about, "has_data": case.has_data, "groups": groups, **bare(case), "ways": found})
     return records
 
 

@@ -90,7 +90,7 @@ def plot(rows: Sequence[Row], path: Path, measure: str, interval: str, across: s
         # Lines step aside a little, lest their intervals cover each other.
         x = [names.index(row[across]) + 0.05 * number for row in mine]
         axes.plot(x, [row[measure] for row in mine], "o-", color=f"C{number}", label=way or measure)
-        axes.vlines(x, *zip(*(row[interval] for row in mine), strict=True), color=f"C{number}")
+        axes.vlines(x, *([row[interval][end] for row in mine] for end in (0, 1)), color=f"C{number}")
     axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
     if measure == "ber":
         axes.set_yscale("symlog", linthresh=1e-5)

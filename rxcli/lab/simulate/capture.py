@@ -1,6 +1,6 @@
 """From a scene to captures in memory: the entry points of the simulator."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -48,7 +48,8 @@ class Capture:
     def developed(self, bits: int = 8) -> NDArray[Any]:
         """(height, width, 3) developed picture of 8 or 16 `bits`, red first."""
         picture = develop(self.raw, self.scene.sensor, self.scene.isp, self.exposure.view, bits)
-        return stabilised(picture, self.exposure) if self.scene.stabilised else picture
+        picture = stabilised(picture, self.exposure) if self.scene.stabilised else picture
+        return warped(picture, np.random.default_rng([self.exposure.link.seed, self.frame, 37]), self.scene.warp)
 
     @cached_property
     def jpeg(self) -> bytes:
@@ -83,10 +84,10 @@ class Recording:
     player: Player | None = None
 
     @property
-    def at_rest(self) -> "Recording":
-        """The same payloads, noise and camera; the screen shows the film's first picture all the time."""
-        scene, link = replace(self.scene, film=Film()), replace(self.link, weights_of=None)
-        return replace(self, scene=scene, link=link, player=None)
+    def plain(self) -> "Recording":
+        """The twin: the same payloads, noise and view; a film rests, and frames stay as their rows saw them."""
+        scene = replace(self.scene, film=Film(), stabilised=False, warp=(0.0, 0.0), averaged=0.0)
+        return replace(self, scene=scene, link=replace(self.link, weights_of=None), player=None)
 
     def exposure(self, frame: int = 0) -> Exposure:
         """What frame number `frame` is about to see."""
@@ -115,11 +116,22 @@ class Recording:
         time_s = frame / self.scene.frame_rate_hz
         return Capture(self.scene, exposure, frame, time_s, raw, recorder.finish() if recorder else None)
 
+    def pictures(self, bits: int = 8, progress: Callable[..., Any] = iter) -> Iterator[NDArray[Any]]:
+        """The developed frames of the scene, mixed over time where its camera does so; see `Capture.developed`."""
+        share, before = self.scene.averaged, None
+        for number in progress(range(self.scene.n_frames)):
+            developed = self.frame(number).developed(bits)
+            picture = developed if before is None else cv2.addWeighted(developed, 1 - share, before, share, 0)
+            before = picture if self.scene.averages_again else developed
+            yield np.asarray(picture)
+
     def truth(self, capture: str) -> dict[str, Any]:
         """The truth of all frames of the scene."""
         return build_truth(self.scene, [self.exposure(n) for n in range(self.scene.n_frames)], capture)
 
 
+#: Range of the knots of a warp along the rows.
+_WARP_KNOTS = (3, 9)
 #: Enlargement after which a stabilised frame shows no border.
 _STABILISED_ZOOM = 1.06
 
@@ -139,6 +151,25 @@ def stabilised(picture: NDArray[Any], exposure: Exposure) -> NDArray[Any]:
     target = square * _STABILISED_ZOOM
     map_back = homography(shifted * to_pixels + matrix[:2, 2], target * to_pixels + matrix[:2, 2])
     return np.asarray(cv2.warpPerspective(picture, map_back, (sensor.width, sensor.height), flags=cv2.INTER_CUBIC))
+
+
+def warped(picture: NDArray[Any], rng: np.random.Generator, share: tuple[float, float]) -> NDArray[Any]:
+    """A picture with its rows moved smoothly, as software that steadies or straightens does.
+
+    Args:
+        picture: (height, width[, colours]).
+        rng: of the warp.
+        share: of the width and of the height by which rows are moved, at most.
+    """
+    if not any(share):
+        return picture
+    y, x = np.mgrid[: picture.shape[0], : picture.shape[1]].astype(np.float32)
+    for axis, (places, size) in enumerate(((x, picture.shape[1]), (y, picture.shape[0]))):
+        knots = rng.uniform(-1, 1, int(rng.integers(*_WARP_KNOTS)))
+        smooth = np.interp(np.linspace(0, knots.size - 1, picture.shape[0]), np.arange(knots.size), knots)
+        smooth = cv2.GaussianBlur(smooth[:, None], (1, 0), 0, sigmaY=picture.shape[0] / (4 * knots.size))
+        places += (smooth / np.abs(smooth).max() * rng.uniform(0, share[axis]) * size).astype(np.float32)
+    return np.asarray(cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def prepare(scene: Scene, rng: np.random.Generator | int) -> Recording:
@@ -203,8 +234,13 @@ def write_capture(
     scene = recording.scene
     if file_format in CODECS:
         bits = 16 if CODECS[file_format].bits > 8 else 8
-        frames = (recording.frame(number).developed(bits) for number in progress(range(scene.n_frames)))
-        write_video(frames, path, Encoding(file_format, bit_rate), scene.frame_rate_hz, scene.orientation)
+        write_video(
+            recording.pictures(bits, progress),
+            path,
+            Encoding(file_format, bit_rate),
+            scene.frame_rate_hz,
+            scene.orientation,
+        )
     elif file_format == "jpeg":
         path.write_bytes(recording.frame().jpeg)
     elif file_format.startswith("dng"):

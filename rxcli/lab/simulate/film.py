@@ -8,7 +8,7 @@ before. The backlight follows the picture from burst to burst.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -24,6 +24,7 @@ _HISTORY = 4
 _LEAD = 600
 #: Refreshes of a zoom in or out, of a scroll with its rest, and of a subtitle; largest zoom.
 _ZOOM_TURN, _STROKE, _SUBTITLE = 90, 45, 50
+FilmKind = Literal["pan", "zoom", "cut", "scenes", "scroll", "window", "subtitles", "pointer"]
 _LETTERS = tuple("abcdefghijklmnopqrstuvwxyz ,.   ")
 
 
@@ -226,7 +227,7 @@ PARTS: dict[str, tuple[Callable[..., Picture], tuple[int, int]]] = {
 _POSITIVE = ("zoom", "cut")
 
 
-def draw_film(kind: str, rng: np.random.Generator) -> Film:
+def draw_film(kind: FilmKind, rng: np.random.Generator) -> Film:
     """A film of one of `FILM_KINDS`, with what people's screens differ in."""
     content_hz, black = float(rng.choice([24.0, 30.0, 60.0])), bool(rng.random() < _BLACK)
     panel = {"scan": rng.uniform(*_SCAN), "response_s": float(np.exp(rng.uniform(*_RESPONSE)))}
@@ -240,14 +241,15 @@ def _drawn_pan(rng: np.random.Generator) -> str:
 
 
 def _drawn_any(rng: np.random.Generator) -> str:
-    return FILM_KINDS[str(rng.choice(["pan", "zoom", "cut"]))](rng)
+    drawn: FilmKind = rng.choice(["pan", "zoom", "cut"])
+    return FILM_KINDS[drawn](rng)
 
 
 #: Logarithms of cells' response (seconds) and of a pan's speed (panel pixels a refresh); share of a refresh that is
 #: written; share of screens with black frames.
 _RESPONSE, _PAN, _SCAN, _BLACK = (np.log(1e-3), np.log(12e-3)), (np.log(0.5), np.log(16.0)), (0.5, 0.98), 0.1
 #: Kinds that `draw_film` knows.
-FILM_KINDS: dict[str, Callable[[np.random.Generator], str]] = {
+FILM_KINDS: dict[FilmKind, Callable[[np.random.Generator], str]] = {
     "pan": _drawn_pan,
     "zoom": lambda rng: f"zoom:{1 + np.exp(rng.uniform(-7, -3.5)):.4f}",
     "cut": lambda rng: f"cut:{rng.integers(4, 60)}",

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from rxcli.lab.simulate.film import draw_film
+from rxcli.lab.simulate.film import FilmKind, draw_film
 from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.optics import FloatArray, Lens, Pose, View
 from rxcli.lab.simulate.pictures import DARK_KINDS, PHOTOS, draw_dark_picture, draw_part
@@ -45,6 +45,9 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     fill: Range = (0.6, 0.97)
     #: How far people's aim strays; 0 for a camera straight before the screen.
     aim: float = 1.0
+    #: Roll, yaw and pitch of a camera held at will, degrees either way, and the share that is drawn of each.
+    tilt_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tilt_share: tuple[float, float] = (1.0, 1.0)
     #: Share of dark pictures, and of lighted rooms.
     dark: float = 0.0
     lighted: float = 0.5
@@ -62,7 +65,7 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     #: Pixels by which a hand moves the picture from frame to frame.
     hand_px: Range = (0.0, 0.0)
     #: Kinds of films that screens show, of `FILM_KINDS`; none for pictures at rest.
-    films: tuple[str, ...] = ()
+    films: tuple[FilmKind, ...] = ()
     #: Fields of the scene that are set at last, as in `vlc-rx simulate --set`.
     scene: dict[str, Any] = {}
 
@@ -114,7 +117,11 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             # LibRaw crops the models that it knows.
             scene = replace(scene, output="raw", make="Synthetic", model=scene.camera_name)
         if self.films:
-            scene = replace(scene, film=draw_film(str(rng.choice(self.films)), rng))
+            scene = replace(scene, film=draw_film(self.films[rng.integers(len(self.films))], rng))
+        if any(self.tilt_deg):
+            tilt = np.array(self.tilt_deg) * rng.uniform(*self.tilt_share, 3) * rng.choice([-1, 1], 3)
+            upright = np.array([scene.pose.roll_deg, scene.pose.yaw_deg, scene.pose.pitch_deg])
+            scene = placed(scene, rng.uniform(*self.fill), (upright + tilt).tolist(), np.zeros(2))
         return with_fields(scene, self.scene), kind
 
 

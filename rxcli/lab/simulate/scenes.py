@@ -102,6 +102,11 @@ class Scene:
     hand_px: float = 0.0
     #: Whether the camera turns and crops its frames so that the hand's motion does not show.
     stabilised: bool = False
+    #: Share of the width and of the height by which its software moves rows of each frame smoothly, at most.
+    warp: tuple[float, float] = (0.0, 0.0)
+    #: Noise reduction over time: share of the frame before in each frame of a clip, and whether that one is mixed too.
+    averaged: float = 0.0
+    averages_again: bool = False
     #: In ascending order of frames; each rules until the next.
     changes: tuple[Change, ...] = ()
     #: EXIF orientation written to files.
