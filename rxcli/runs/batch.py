@@ -5,8 +5,10 @@ Results come source by source in the order of the input in either case; `rxcli.r
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
+import re
 import signal
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -51,6 +53,13 @@ _Results = SimpleQueue[FrameResult | Exception | None]
 
 #: Errors that end the run, whatever the source.
 _ENDS_RUN = (UsageError, ProfileError, OutputError)
+#: Errors of rights, disks, networks and memory, which pass.
+_OF_THE_MACHINE = (
+    *(errno.EACCES, errno.EPERM, errno.EIO, errno.ENOMEM, errno.ENOSPC, errno.EMFILE, errno.ENFILE, errno.EBUSY),
+    *(errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.ENODEV, errno.ENXIO, errno.EHOSTDOWN, errno.EAGAIN),
+)
+#: Folders that storage, cameras and programs keep beside photos: `@eaDir`, `#recycle`, `$RECYCLE.BIN`, thumbnails.
+_ASIDE = re.compile(r"[@#$]|__MACOSX$|lost\+found$|thumb(nail)?s?$", re.IGNORECASE)
 #: What these signals mean is decided by the first process; they often come to all at once.
 _FIRST_DECIDES = (signal.SIGINT, signal.SIGTERM)
 #: Sources per worker that may be decoded ahead of the one whose results are being taken.
@@ -126,7 +135,11 @@ def _sources_of(path: str, suffixes: frozenset[str]) -> Iterator[Source]:
 
 def _walk(folder: str, refused: Callable[[OSError], None]) -> Iterator[str]:
     for parent, folders, files in os.walk(folder, onerror=refused):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        shown = sorted(name for name in folders if not name.startswith("."))
+        folders[:] = [name for name in shown if not (_ASIDE.match(name) or os.path.islink(os.path.join(parent, name)))]
+        for name in sorted({*shown} - {*folders}):
+            what = "thumbnails or deleted files" if _ASIDE.match(name) else "it is a link"
+            log.warning("%s: passed over (%s); name the folder itself to decode it", os.path.join(parent, name), what)
         if OUTPUT_MARKER in files:  # what `inspect` has written
             folders.clear()
             continue
@@ -157,7 +170,7 @@ class Decoder:
             ProfileError: likewise.
             OutputError: taps cannot be written.
         """
-        problems: list[str] = []
+        problems: list[tuple[str, bool]] = []
         count = 0
         try:
             for result in self.linked(self.receive(self._frames(source, problems), self._options_of(source))):
@@ -169,11 +182,11 @@ class Decoder:
         except _ENDS_RUN:
             raise
         except Exception as error:
-            problems.append(_problem(error, source))
+            problems.append((_problem(error, source), _may_pass(error)))
         if not (problems or count):
-            problems.append(f"{source.name}: holds no picture; name another file")
+            problems.append((f"{source.name}: holds no picture; name another file", False))
         if problems:
-            yield unreadable(source, count, problems[-1])
+            yield unreadable(source, count, *problems[-1])
 
     def linked(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
         """Results with the messages and files that are complete with them.
@@ -192,7 +205,7 @@ class Decoder:
                 taken = replace(taken, soft_bits=result.soft_bits if alone else None)
             yield explained(taken)
 
-    def _frames(self, source: Source, problems: list[str]) -> Iterator[Frame]:
+    def _frames(self, source: Source, problems: list[tuple[str, bool]]) -> Iterator[Frame]:
         """The frames of a source up to a failure, which joins `problems`: the receiver still gives what it holds."""
         warned = False
         try:
@@ -209,7 +222,7 @@ class Decoder:
         except _ENDS_RUN:
             raise
         except Exception as error:
-            problems.append(_problem(error, source))
+            problems.append((_problem(error, source), bool(source.problem) or _may_pass(error)))
 
     def _options_of(self, source: Source) -> Any:
         """The options with a place of its own for the source's taps."""
@@ -228,9 +241,18 @@ def _problem(error: Exception, source: Source) -> str:
     return f"internal error ({type(error).__name__}: {error}); run again with --verbose and report it"
 
 
-def unreadable(source: Source, frame: int, message: str) -> FrameResult:
-    """The result of a frame that could not be had."""
-    return FrameResult(source=source.name, frame=frame, time_s=0.0, status="unreadable", message=message)
+def _may_pass(error: BaseException | None) -> bool:
+    """Whether an error, or one that led to it, is the machine's and not the file's."""
+    while error is not None:
+        if is_out_of_memory(error) or (isinstance(error, OSError) and error.errno in _OF_THE_MACHINE):
+            return True
+        error = error.__context__
+    return False
+
+
+def unreadable(source: Source, frame: int, message: str, retry: bool = True) -> FrameResult:
+    """The result of a frame that could not be had; `retry`: a later run may have it."""
+    return FrameResult(source=source.name, frame=frame, time_s=0.0, status="unreadable", message=message, retry=retry)
 
 
 def with_last(results: Iterator[FrameResult]) -> Iterator[tuple[FrameResult, bool]]:
@@ -364,7 +386,7 @@ class _Pool:
             if attempt is self._permits:
                 log.warning("%s: the process that decoded it %s; it is tried again", source.name, ending)
         message = f"{source.name}: two processes that decoded it died, the last one {ending}; try it by itself"
-        yield replace(unreadable(source, count, message), retry=True)
+        yield unreadable(source, count, message)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:

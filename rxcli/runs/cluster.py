@@ -57,13 +57,28 @@ def decode_on_cluster(
         InputError: the scheduler went away, or its workers cannot decode; what was taken till then is complete.
     """
     with _connect(address, connect_s) as client:
+        #: Workers that do not see a file that is there.
+        blind = set[str]()
 
         def submit(source: Source) -> Any:
             task = replace(source, path=os.path.abspath(source.path))
-            return client.submit(_decode, decoder, task, pure=False, retries=_RETRIES)
+            seeing = [worker for worker in client.nthreads() if worker not in blind] if blind else None
+            where: dict[str, Any] = {"workers": seeing, "allow_other_workers": True} if seeing else {}
+            is_there = os.access(task.path, os.R_OK)
+            return client.submit(_decode, decoder, task, is_there, pure=False, retries=_RETRIES, **where)
 
         for source, future in in_order(sources, submit, _IN_FLIGHT):
-            results, taps = _await(source, future, address)
+            outcome, tried = _await(source, future, address), set[str]()
+            while isinstance(outcome, str) and outcome not in tried:
+                if outcome not in blind:
+                    log.warning("the worker %s does not see %s; others are asked", outcome, source.name)
+                tried.add(outcome)
+                blind.add(outcome)
+                outcome = _await(source, submit(source), address)
+            if isinstance(outcome, str):
+                message = f"{source.name}: no worker sees it; give them the folder under the same path"
+                outcome = [unreadable(source, 0, message)], []
+            results, taps = outcome
             _write(taps, decoder)
             yield source, iter(results)
 
@@ -111,8 +126,16 @@ def _silent() -> Iterator[None]:
         logging.disable(logging.NOTSET)
 
 
-def _decode(decoder: Decoder, source: Source) -> _Outcome:
+class _UnseenError(Exception):
+    """A file that is there is not where this worker looks; the argument is the worker's address."""
+
+
+def _decode(decoder: Decoder, source: Source, is_there: bool = False) -> _Outcome:
     """Decode a source on a worker; what is tapped comes back with the results, for the disk may be another one."""
+    if is_there and not os.access(source.path, os.R_OK):
+        from distributed import get_worker
+
+        raise _UnseenError(get_worker().address)
     with TemporaryDirectory(prefix="vlc-rx-") as scratch:
         for option in _folders(decoder):
             decoder = _tapping_into(decoder, option, Path(scratch) / option)
@@ -154,7 +177,8 @@ def _write(taps: list[_Tap], decoder: Decoder) -> None:
         write_whole(path, data, follow=False)
 
 
-def _await(source: Source, future: Any, address: str) -> _Outcome:
+def _await(source: Source, future: Any, address: str) -> _Outcome | str:
+    """What a worker made of a source, or the address of one that does not see it."""
     from concurrent.futures import CancelledError
 
     from distributed import KilledWorker
@@ -164,10 +188,12 @@ def _await(source: Source, future: Any, address: str) -> _Outcome:
         return decoded
     except KilledWorker:
         message = f"{source.name}: every worker that decoded it died; try it by itself"
-        return [replace(unreadable(source, 0, message), retry=True)], []
+        return [unreadable(source, 0, message)], []
     except (OSError, CancelledError) as error:
         reason = f"the scheduler at {address!r} went away ({type(error).__name__})"
         raise InputError(reason, "start it again and use --resume") from None
+    except _UnseenError as error:
+        return str(error)
     except ReceiverError:
         raise
     except Exception as error:  # what a worker raises that cannot even load the task

@@ -1,12 +1,15 @@
 """Batches: which files, in which order, by whom, and what a kill leaves behind."""
 
+import errno
 import json
 import os
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 from fake_receiver import fake_decoder
 
@@ -16,6 +19,7 @@ from rxcli.results.record import to_json_line
 from rxcli.runs.batch import Source, collect_sources, decode_here, decode_in_processes, unreadable
 from rxcli.runs.journal import Head, Journal, Lines
 from rxcli.runs.provenance import settings_in_force
+from rxcli.types import Frame
 
 SUFFIXES = frozenset({".jpg", ".mp4"})
 
@@ -38,6 +42,55 @@ def test_folders_are_walked_in_order_and_files_taken_once(tmp_path: Path) -> Non
     paths = [str(tmp_path / name) for name in ("notes.txt", "b.jpg", ".", "missing")]
     found = [os.path.relpath(source.name, tmp_path) for source in collect_sources(paths, SUFFIXES)]
     assert found == ["notes.txt", "b.jpg", "a.MP4", "sub/c.jpg", "missing"]
+
+
+def test_what_lies_beside_photos_is_passed_over_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    aside = ("@eaDir/a.jpg", "#recycle", "$RECYCLE.BIN", "__MACOSX", "sub/Thumbnails")
+    for name in ("a.jpg", "sub/c.jpg", *(f"{folder}/x.jpg" for folder in aside)):
+        (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
+        (tmp_path / name).touch()
+    (tmp_path / "other").symlink_to(tmp_path / "sub")
+    found = [os.path.relpath(source.name, tmp_path) for source in collect_sources([str(tmp_path)], SUFFIXES)]
+    assert found == ["a.jpg", "sub/c.jpg"]
+    said = sorted(os.path.relpath(record.args[0], tmp_path) for record in caplog.records)
+    assert said == sorted(["#recycle", "$RECYCLE.BIN", "@eaDir", "__MACOSX", "other", "sub/Thumbnails"])
+    inside = collect_sources([str(tmp_path / "@eaDir" / "a.jpg"), str(tmp_path / "other")], SUFFIXES)
+    assert [os.path.basename(source.name) for source in inside] == ["x.jpg", "c.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("error", "is_tried_again"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied"), True),
+        (OSError(errno.EIO, "Input/output error"), True),
+        (OSError(errno.ESTALE, "Stale file handle"), True),
+        (MemoryError(), True),
+        (OSError("image file is truncated"), False),
+        (FileNotFoundError(errno.ENOENT, "No such file"), False),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("is_explained", [False, True])
+def test_a_failure_of_the_machine_is_tried_again(error: Exception, is_tried_again: bool, is_explained: bool) -> None:
+    """Whether a reader explains it or not; a failure of the file is not."""
+
+    def fail(path: str) -> Iterator[Frame]:
+        yield Frame(np.zeros((1, 1), np.uint8), source=path)
+        try:
+            raise error
+        except Exception:
+            if is_explained:
+                raise InputError(f"{path}: cannot be read", "check the disk") from None
+            raise
+
+    decoder = replace(fake_decoder(), open_source=fail)
+    *_, last = decoder.results(Source("a", "a"))
+    assert (last.status, last.retry) == ("unreadable", is_tried_again)
+
+
+def test_a_folder_that_may_be_read_later_leaves_no_failure() -> None:
+    [result] = fake_decoder().results(Source("a", "a", "a: the folder may not be read"))
+    assert result.retry
 
 
 def test_pictures_without_an_extension_are_known_by_their_content(tmp_path: Path) -> None:

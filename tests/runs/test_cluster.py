@@ -2,6 +2,7 @@
 
 import gc
 import json
+import os
 import re
 import signal
 import socket
@@ -9,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -84,6 +85,46 @@ def test_a_run_is_complete_and_in_order_though_a_worker_is_killed(tmp_path: Path
             assert first.wait() == -signal.SIGKILL
             assert second.poll() is None
     assert lines == alone
+
+
+UNSEEING = """
+import os, sys
+from distributed.cli.dask_worker import main
+share, access = sys.argv.pop(1), os.access
+os.access = lambda path, mode: not str(path).startswith(share) and access(path, mode)
+main()
+"""
+
+
+@pytest.mark.parametrize("n_seeing", [1, 0])
+def test_what_a_worker_without_the_share_does_not_see_goes_to_another(
+    tmp_path: Path, n_seeing: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "share").mkdir()
+    sources = write_orders(tmp_path / "share")[:8]
+    sources.append(Source("missing", str(tmp_path / "share" / "missing")))
+    alone = [to_json_line(result) for _, results in decode_here(sources, fake_decoder()) for result in results]
+    scheduler_options = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
+    options = ("--no-nanny", "--nthreads", "1", "--no-dashboard", "--local-directory", str(tmp_path))
+    with ExitStack() as stack:
+        scheduler = stack.enter_context(process("distributed.cli.dask_scheduler", *scheduler_options))
+        address = wait_for(scheduler, r"Scheduler at:\s*(tcp://[0-9.:]+)").group(1)
+        (tmp_path / "unseeing.py").write_text(UNSEEING)
+        stack.enter_context(pytest.MonkeyPatch.context()).setitem(ENVIRONMENT, "PYTHONPATH", path_with(tmp_path))
+        for module, *more in [("unseeing", str(tmp_path / "share"))] + [("distributed.cli.dask_worker",)] * n_seeing:
+            wait_for(stack.enter_context(process(module, *more, address, *options)), "Registered to")
+        decoded = [result for _, results in decode_on_cluster(sources, fake_decoder(), address) for result in results]
+    if n_seeing:
+        assert [to_json_line(result) for result in decoded] == alone
+    else:
+        assert {(result.status, result.retry) for result in decoded[:-1]} == {("unreadable", True)}
+        assert "no worker sees it; give them the folder under the same path" in decoded[0].message
+        assert "no picture" in decoded[-1].message
+    assert len([record for record in caplog.records if "does not see" in record.getMessage()]) <= 1
+
+
+def path_with(folder: Path) -> str:
+    return os.pathsep.join([ENVIRONMENT["PYTHONPATH"], str(folder)])
 
 
 def contents(folder: Path) -> dict[str, bytes]:
