@@ -194,3 +194,16 @@ def test_tilted_screens_stay_in_view_and_zero_tilt_draws_as_before() -> None:
         corners = View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect).corners
         assert (corners > -1).all()
         assert (corners < [sensor.width, sensor.height]).all()
+
+
+def test_media_have_an_exposure_and_need_not_show_a_screen() -> None:
+    points = scenarios()["speed"].points
+    long = Medium(**points["phone 12 MP, 4 slots"]).scene
+    assert long.exposure_s * long.screen.slot_rate_hz == pytest.approx(4)
+    steady = draw.prepare(Medium(**points["phone 12 MP, no screen"], scale=0.1).scene, 1)
+    (lit,) = steady.exposure().lit
+    assert lit == pytest.approx(np.ones_like(lit))
+    edges = steady.exposure().pixels_to_screen(np.array([[0.0, 0], [399, 0], [399, 299], [0, 299]]))
+    assert ((edges > 0) & (edges < 1)).all()
+    rows = steady.frame().rgb[..., 1].astype(float).mean(axis=1)
+    assert np.abs(np.diff(rows)).max() < 0.2 * rows.mean()

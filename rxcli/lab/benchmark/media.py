@@ -17,6 +17,9 @@ from rxcli.lab.simulate.truth import build_camera_profile, write_truth
 from rxcli.profiles import dump_profile
 from rxcli.protocol import payload_bits
 
+#: Width of what fills a photograph, in widths of it.
+_BEYOND_EDGES = 1.6
+
 
 @dataclass(frozen=True, kw_only=True)
 class Medium:
@@ -28,6 +31,10 @@ class Medium:
     picture: str = "coffee"
     #: Light against the preset's.
     light: float = 1.0
+    #: In slots; None for the preset's. The gain follows.
+    exposure_slots: float | None = None
+    #: False for the picture itself in steady light, beyond the edges of the photograph.
+    is_screen: bool = True
     #: Width and height against the preset's.
     scale: float = 1.0
     #: Whether camera and screen are given.
@@ -46,6 +53,11 @@ class Medium:
         """The scene of a photograph, or of a clip whose payload comes again after its last frame."""
         scene = preset(self.camera, self.screen)
         scene = replace(scene, picture=self.picture, light_e_per_s=scene.light_e_per_s * self.light)
+        if self.exposure_slots is not None:
+            scene = scene.metered(self.exposure_slots / scene.screen.slot_rate_hz)
+        if not self.is_screen:
+            pose = replace(scene.pose, fill=_BEYOND_EDGES)
+            scene = replace(scene, waveform=np.ones_like, dimming="none", panel=0.0, pose=pose)
         scene = scene.scaled(self.scale, self.scale, keep_readout=True) if self.scale != 1 else scene
         if self.bursts_a_frame is None:
             return scene

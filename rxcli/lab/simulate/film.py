@@ -184,7 +184,7 @@ def _window(picture: Picture, refresh: float, seed: Seed) -> Picture:
     rng, (height, width) = np.random.default_rng(seed), picture.shape[:2]
     kind = str(rng.choice([*DARK_KINDS, *["photo"] * len(DARK_KINDS)]))
     desk = _photo(rng, picture) if kind == "photo" else draw_dark_picture(kind, rng, width, height)
-    share = rng.uniform(0.3, 0.7)
+    share = rng.uniform(0.4, 0.85)
     size = round(width * share), round(height * share)
     left, top = int(rng.integers(0, width - size[0] + 1)), int(rng.integers(0, height - size[1] + 1))
     desk = desk.copy()
