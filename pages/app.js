@@ -138,6 +138,14 @@
     busy = false;
   }
 
+  // Answers of a proxy between this page and its server.
+  const away = ["The proxy of this page does not reach its server.", "Inform the operator of this page."];
+  const REFUSED = {
+    403: ["The proxy of this page refuses uploads.", "Inform the operator of this page."],
+    404: ["The server was started anew, and its address has changed.", "Open the address that it shows now."],
+    413: ["The file is larger than the proxy of this page lets pass.", "Send a smaller one, or have its operator raise that limit."],
+    502: away, 503: away, 504: away,
+  };
   const failed = (reason, advice) => ({ status: "unreadable", headline: "The file could not be read", reason, advice });
 
   // The answer for a file; while a clip is read, what is known so far is shown.
@@ -146,7 +154,9 @@
     try {
       const headers = { "Content-Type": "application/octet-stream", "Accept": "application/x-ndjson, application/json", "X-Session": session };
       const response = await fetch("photo", { method: "POST", body: entry.file, headers });
-      if (!response.headers.get("Content-Type").startsWith("application/x-ndjson")) return await response.json();
+      const type = response.headers.get("Content-Type") || "";
+      if (!type.includes("json")) return failed(...(REFUSED[response.status] || [`The server answered with status ${response.status}.`, "Inform the operator of this page."]));
+      if (!type.startsWith("application/x-ndjson")) return await response.json();
       return await lines(response, (answer) => {
         if (answer.status === "waiting") $("progress").textContent = `Waiting: ${count(answer.place, "picture")} before yours …`;
         else { answered(entry, answer); $("progress").textContent = "Reading the rest of the clip …"; }

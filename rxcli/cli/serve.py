@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 @click.argument("device", required=False, type=click.Path(path_type=Path))
 @options(
     ("--host", str, None, "Where to listen: 0.0.0.0 for phones in the same network. [default: this machine alone]"),
+    ("--proxy", str, None, "Where a proxy shows the page: https://lab.example.org."),
     ("--port", click.IntRange(0, 65535), 8017, "0 takes any free one."),
     ("--keep", FOLDER, None, "Keep uploads in this folder."),
     ("--max-upload", click.IntRange(1, 4096), 96, "Megabytes a file."),
@@ -51,11 +52,16 @@ def _site(device: Path | None, options: dict[str, Any]) -> Site:
     from rxcli.ingest.v4l2 import CameraSettings
     from rxcli.web.server import Bounds, Site
 
+    if options["proxy"] and not options["proxy"].startswith(("http://", "https://")):
+        raise UsageError(
+            f"--proxy {options['proxy']!r} is no address", "name all of it, such as https://lab.example.org"
+        )
     return Site(
         options=receiver_options(options, soft_bits=True),
         host=options["host"] or "127.0.0.1",
         port=options["port"],
         token=secrets.token_urlsafe(12) if options["host"] else None,
+        proxy=options["proxy"],
         device=device,
         camera=CameraSettings(exposure_s=options["exposure"], gain=options["gain"], wait=True),
         keep=options["keep"],
@@ -75,6 +81,8 @@ async def _run(site: Site) -> None:
             for_phones = ""
             _show_qr(server.address)
         click.echo(server.address)
+        for address in server.addresses[1:]:
+            click.echo(f"or {address}", err=True)
         click.echo(f"Ctrl-C stops it.{for_phones}", err=True)
         sys.stdout.flush()
         await stopped.wait()

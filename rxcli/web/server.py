@@ -11,8 +11,10 @@ import itertools
 import json
 import logging
 import os
+import re
 import shutil
 import socket
+import sys
 import time
 import uuid
 from collections import deque
@@ -51,15 +53,24 @@ _HEADERS = {
     "Cache-Control": "no-store",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cross-Origin-Opener-Policy": "same-origin",
+    "X-Accel-Buffering": "no",  # a proxy passes on at once what is known so far
 }
 #: A line of JSON for each answer: partial answers, then the complete one.
 _LINES = "application/x-ndjson"
 #: Header that is equal for all photos to be combined, and its maximum length.
 _SESSION, _SESSION_CHARACTERS = "X-Session", 64
-_LOCAL = ("127.0.0.1", "localhost", "::1", "[::1]")
+_LOCAL = ("127.0.0.1", "localhost", "[::1]")
+#: A name or address, and perhaps a port, as Host and Origin have them.
+_HOST = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^:\[\]/]+)(:\d*)?")
+_EVERYWHERE = ("0.0.0.0", "::")
+#: Addresses for documentation (RFC 5737, 3849), which are never reached.
+_NOWHERE = {socket.AF_INET: "192.0.2.1", socket.AF_INET6: "2001:db8::1"}
+#: Request of Linux for the address of an interface, where it stands in the answer, and where interfaces are described.
+_INTERFACE_ADDRESS, _PLACE, _INTERFACES = 0x8915, slice(20, 24), Path("/sys/class/net")
 _CHUNK = 1 << 16
 #: Where the process that decodes opens a file of this one that has no name.
 _OPEN_FILES = Path(f"/proc/{os.getpid()}/fd")
+_PROXY = "open the address that the server shows; behind a proxy, start it with --proxy and the address of that"
 #: Receives the answers of a picture or the events of a camera, one after the other.
 _Publish = Callable[[dict[str, Any]], None]
 _SWEEP_S = 2.0
@@ -100,6 +111,8 @@ class Site:
     port: int = 8017
     #: Secret part of the address if other machines can reach the server, or None.
     token: str | None = None
+    #: Name or address under which a proxy shows the page, or None.
+    proxy: str | None = None
     device: Path | None = None
     camera: CameraSettings = field(default_factory=lambda: CameraSettings(wait=True))
     #: Folder in which uploads are stored permanently, or None.
@@ -111,20 +124,51 @@ class Site:
         """What every address starts with."""
         return f"/{self.token}" if self.token else ""
 
-    def address(self, port: int) -> str:
-        """What to open in a browser."""
-        host = self.host if self.host not in ("0.0.0.0", "::") else own_address()
-        return f"http://{f'[{host}]' if ':' in host else host}:{port}{self.prefix}/"
+    @property
+    def proxy_name(self) -> str | None:
+        """Name by which a proxy shows the page."""
+        return None if self.proxy is None else _name_of(self.proxy.partition("://")[2].split("/")[0])
+
+    def addresses(self, port: int) -> list[str]:
+        """What to open in a browser, the likeliest first."""
+        if self.proxy is not None:
+            return [f"{self.proxy.rstrip('/')}{self.prefix}/"]
+        hosts = own_addresses() if self.host in _EVERYWHERE else [self.host]
+        return [f"http://{_bracketed(host)}:{port}{self.prefix}/" for host in hosts]
 
 
-def own_address() -> str:
-    """This machine's address in its network, from the system's routes; nothing is sent."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # never reached: an address for documentation (RFC 5737)
-            return str(probe.getsockname()[0])
-        except OSError:
-            return "127.0.0.1"
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+def _name_of(host: str) -> str | None:
+    """Host without its port; None where it is none."""
+    found = _HOST.fullmatch(host)
+    return found[1].lower() if found else None
+
+
+def own_addresses() -> list[str]:
+    """This machine's addresses in its networks; those of cables and radio first, since a VPN leads elsewhere."""
+    found = [own for family in _NOWHERE if (own := _routed(family))]
+    if sys.platform == "linux":
+        import fcntl
+
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            for _, name in socket.if_nameindex():
+                with contextlib.suppress(OSError):  # it has none
+                    answer = fcntl.ioctl(probe, _INTERFACE_ADDRESS, name.encode().ljust(40, b"\0"))
+                    own = socket.inet_ntoa(answer[_PLACE])
+                    found.insert(0 if (_INTERFACES / name / "device").exists() else len(found), own)
+    shown = [own for own in dict.fromkeys(found) if not own.startswith("127.")]
+    return shown or ["127.0.0.1"]
+
+
+def _routed(family: socket.AddressFamily) -> str | None:
+    """The address by which this machine would send to others, or None; nothing is sent."""
+    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.connect((_NOWHERE[family], 9))
+        return str(probe.getsockname()[0])
+    return None
 
 
 @dataclass(eq=False, slots=True)
@@ -177,9 +221,14 @@ class Server:
         await self._stop()
 
     @property
+    def addresses(self) -> list[str]:
+        """What to open in a browser, the likeliest first."""
+        return self._site.addresses(self.port)
+
+    @property
     def address(self) -> str:
-        """What to open in a browser."""
-        return self._site.address(self.port)
+        """The likeliest address."""
+        return self.addresses[0]
 
     async def _start(self) -> None:
         site = self._site
@@ -188,6 +237,8 @@ class Server:
             self._kept_bytes = sum(path.stat().st_size for path in site.keep.iterdir() if path.is_file())
         app = web.Application(middlewares=[self._guard], client_max_size=1 << 16)
         app.router.add_get(f"{site.prefix}/", self._index)
+        if site.token is not None:  # as people type it
+            app.router.add_get(site.prefix, self._with_slash)
         app.router.add_get(f"{site.prefix}/asset/{{name}}", self._asset)
         app.router.add_post(f"{site.prefix}/photo", self._photo)
         app.router.add_get(f"{site.prefix}/live", self._events)
@@ -198,7 +249,11 @@ class Server:
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._thread, self._decoder.start)
         try:
-            await web.TCPSite(self._runner, site.host, site.port, backlog=32).start()
+            if site.host == "::" and socket.has_dualstack_ipv6():  # asyncio would not listen to IPv4
+                dual = socket.create_server(("::", site.port), family=socket.AF_INET6, dualstack_ipv6=True)
+                await web.SockSite(self._runner, dual, backlog=32).start()
+            else:
+                await web.TCPSite(self._runner, site.host, site.port, backlog=32).start()
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             raise UsageError(f"cannot serve at {site.host}:{site.port} ({reason})", "choose another --port") from None
@@ -229,10 +284,10 @@ class Server:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Any) -> web.StreamResponse:
         """Refuse requests from other origins or to other host names, and add the security headers."""
-        if not self._is_ours(request):
-            raise web.HTTPForbidden(text="not from this page", headers=_HEADERS)
+        if self._site.proxy and (senders := request.headers.get("X-Forwarded-For")):
+            request = request.clone(remote=senders.rpartition(",")[2].strip())  # else all share one visitor's places
         try:
-            response: web.StreamResponse = await handler(request)
+            response: web.StreamResponse = self._refused_visit(request) or await handler(request)
         except web.HTTPException as error:
             error.headers.update(_HEADERS)
             raise
@@ -252,19 +307,28 @@ class Server:
         except (ConnectionError, TimeoutError):
             _abort(request)
 
-    def _is_ours(self, request: web.Request) -> bool:
-        site, host = self._site, request.host
+    def _refused_visit(self, request: web.Request) -> web.Response | None:
+        """The answer to a request that is not for this page, or not from it; None for the others."""
+        site, host, name = self._site, request.host, _name_of(request.host)
         if site.token is not None:
             given = request.path.removeprefix("/").split("/")[0]
             if not hmac.compare_digest(given.encode(), site.token.encode()):
                 raise web.HTTPNotFound(headers=_HEADERS)
-        elif host.rsplit(":", 1)[0] not in (*_LOCAL, site.host):
-            return False  # a name that somebody else has pointed at this machine
+        own_names = (*_LOCAL, _bracketed(site.host), site.proxy_name) if site.token is None else (name,)
+        if name is None or name not in own_names:  # perhaps one that somebody else has pointed at this machine
+            return _refused(403, "the page was asked for by another name than its own", _PROXY)
         is_visit = request.method == "GET" and request.headers.get("Sec-Fetch-Dest") == "document"
-        if not is_visit and request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
-            return False
-        origin = request.headers.get("Origin")
-        return origin is None or origin in (f"http://{host}", f"https://{host}")
+        sender, (_, _, origin) = (
+            request.headers.get("Sec-Fetch-Site"),
+            request.headers.get("Origin", "").partition("://"),
+        )
+        if sender is None and "Origin" in request.headers:  # without encryption, browsers state the origin alone
+            is_own = bool(origin) and origin in (host, request.headers.get("X-Forwarded-Host"))
+            is_shown = site.proxy_name is not None and _name_of(origin) == site.proxy_name
+            sender = "same-origin" if is_own or is_shown else "cross-site"
+        if not is_visit and sender not in (None, "none", "same-origin"):
+            return _refused(403, "the request came from another page", _PROXY)
+        return None
 
     async def _sweep(self) -> None:
         """Close idle connections: after a time, and the oldest ones if there are too many."""
@@ -293,6 +357,9 @@ class Server:
         for name, value in {"kept": retention, "live": live, "largest": site.bounds.upload_bytes}.items():
             text = text.replace("{{" + name + "}}", str(value))
         return web.Response(text=text, content_type="text/html")
+
+    async def _with_slash(self, request: web.Request) -> web.Response:
+        raise web.HTTPPermanentRedirect(f"{self._site.token}/")
 
     async def _asset(self, request: web.Request) -> web.Response:
         kind = _ASSETS.get(request.match_info["name"])

@@ -48,7 +48,7 @@ from rxcli.runs.processes import resident_bytes
 from rxcli.types import ColumnResult, FrameResult, FrameSoftBits, Message, PacketResult, ReceivedObject
 from rxcli.web.decoding import DecodingProcess, Limits, _photos_of, answer_for
 from rxcli.web.live import live_events
-from rxcli.web.server import Bounds, Server, Site
+from rxcli.web.server import Bounds, Server, Site, own_addresses
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_frames"
 MEGABYTE = 1 << 20
@@ -248,6 +248,99 @@ def test_who_may_ask(options: ReceiverOptions) -> None:
 
     serving(Site(options, port=0), local)
     serving(Site(options, port=0, host="0.0.0.0", token="secret"), elsewhere)
+
+
+LAB, SAME = "lab.example.org", {"Sec-Fetch-Site": "same-origin"}
+
+
+@pytest.mark.parametrize(
+    ("proxy", "expected"),
+    [  # as nginx passes a request on by default, of a browser over HTTPS; over HTTP; with the host that it was sent to
+        (
+            None,
+            [
+                ({"Origin": f"https://{LAB}", **SAME}, 200),
+                ({"Origin": f"http://{LAB}"}, 403),
+                ({"Origin": f"http://{LAB}", "X-Forwarded-Host": LAB}, 200),
+                ({"Origin": f"https://{LAB}", "Host": LAB, **SAME}, 403),  # a name that is pointed at this machine
+                ({"Origin": "null"}, 403),
+                ({"Host": "localhost:1x"}, 403),
+            ],
+        ),
+        (
+            f"http://{LAB}:8080/rx",
+            [
+                ({"Origin": f"http://{LAB}:8080"}, 200),
+                ({"Origin": f"http://{LAB}:8080", "Host": LAB, **SAME}, 200),
+                ({"Origin": "https://evil.example"}, 403),
+                ({"Origin": "null"}, 403),
+                ({"Origin": f"http://{LAB}:8080", "Sec-Fetch-Site": "cross-site"}, 403),
+            ],
+        ),
+    ],
+    ids=["unnamed", "named"],
+)
+def test_behind_a_proxy(
+    options: ReceiverOptions, proxy: str | None, expected: list[tuple[dict[str, str], int]]
+) -> None:
+    async def work(server: Server, client: Any) -> None:
+        for headers, status in expected:
+            async with client.post(f"http://127.0.0.1:{server.port}/photo", data=b"hello", headers=headers) as answer:
+                assert (answer.status, headers) == (status, headers)
+                assert set(await answer.json()) >= {"reason", "advice"}
+        assert proxy is None or server.address == f"{proxy}/"
+
+    serving(Site(options, port=0, proxy=proxy), work)
+
+
+def test_visitors_of_a_proxy_are_told_apart(options: ReceiverOptions) -> None:
+    """One of them gets half of the places."""
+
+    async def work(server: Server, client: Any) -> None:
+        held = "POST /photo", "Content-Length: 9\r\nX-Forwarded-For: 10.0.0.1, 10.0.0."
+        slow = [await raw(server, held[0], f"{held[1]}{n}\r\n\r\n".encode()) for n in (7, 7, 8)]
+        await asyncio.sleep(0.2)
+        visitors = [upload.visitor for upload in server._arriving]
+        for _, writer in slow:
+            writer.close()
+        assert visitors == ["10.0.0.7", "10.0.0.7", "10.0.0.8"]
+
+    serving(Site(options, port=0, proxy="https://lab.example.org"), work)
+
+
+def test_the_address_opens(options: ReceiverOptions, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By IPv6 and IPv4, with and without its last slash."""
+
+    async def work(server: Server, client: Any) -> None:
+        for host in ("127.0.0.1", "[::1]"):
+            for slash in ("", "/"):
+                async with client.get(f"http://{host}:{server.port}/secret{slash}") as answer:
+                    assert answer.status == 200
+        assert all(address.endswith(f":{server.port}/secret/") for address in server.addresses)
+
+    serving(Site(options, port=0, host="::", token="secret"), work)
+
+
+def test_addresses_without_a_route_and_with_a_tunnel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of interfaces with a device first: what sends to others may be a tunnel."""
+    addresses = {"lo": "127.0.0.1", "tun0": "10.8.0.2", "wlan0": "192.168.1.7", "docker0": "172.17.0.1"}
+
+    def ask(_: object, _request: int, data: bytes) -> bytes:
+        name = data.rstrip(b"\0").decode()
+        if name not in addresses:
+            raise OSError(99, "Cannot assign requested address")
+        return bytes(20) + socket.inet_aton(addresses[name]) + bytes(16)
+
+    (tmp_path / "wlan0" / "device").mkdir(parents=True)
+    monkeypatch.setattr("rxcli.web.server._INTERFACES", tmp_path)
+    monkeypatch.setattr("fcntl.ioctl", ask)
+    monkeypatch.setattr("socket.if_nameindex", lambda: list(enumerate(["eth0", *addresses])))
+    monkeypatch.setattr("rxcli.web.server._routed", {socket.AF_INET: "10.8.0.2", socket.AF_INET6: None}.get)
+    assert own_addresses() == ["192.168.1.7", "10.8.0.2", "172.17.0.1"]
+    monkeypatch.setattr("rxcli.web.server._routed", lambda _: None)
+    assert own_addresses()[0] == "192.168.1.7"
+    addresses.clear()
+    assert own_addresses() == ["127.0.0.1"]
 
 
 async def raw(
