@@ -15,7 +15,7 @@ from rxcli.lab.benchmark import measures, tables
 from rxcli.lab.benchmark import quick as headline
 from rxcli.lab.benchmark.cases import OTHER_KERNEL, TWIN, WAYS
 from rxcli.lab.benchmark.draw import People
-from rxcli.lab.benchmark.runner import Run, Scenario, capture_points, load_journal, scenarios
+from rxcli.lab.benchmark.runner import Run, Scenario, capture_points, labels_by_field, load_journal, scenarios
 from rxcli.outputs import claim_own_folder, write_whole
 
 _COUNT = click.IntRange(1)
@@ -25,6 +25,7 @@ _OUT = ("--out", FOLDER, Path("benchmark-results"), "Folder of results.")
 _SEED = ("--seed", click.IntRange(0, 10**6), 0, "Of all random scenes.")
 _COUNTED = ("--count", _COUNT, None, "Numbers to draw at each point.  [default: the scenario's]")
 _CAPTURES = ("--folder captures", _FOLDER, None, "Of `captures` and `files`: where they lie.  [default: the samples]")
+_OVER = ("--over", str, None, "Of `files`: rows by this field of a CSV beside the captures, or of their metadata.")
 _ONLY = ("--only", [str], None, "A point of the scenario; may be given several times.")
 _SET = ("--set fields", [str], None, "A field of every point, as exposure_slots=[3,6]; may be given several times.")
 _QUIET = ("--quiet", None, False, "No progress bar.")
@@ -41,7 +42,7 @@ class _Scenarios(SuggestingGroup):
         if name not in scenarios():
             return super().get_command(context, name)
         command = click.pass_context(_run_scenario)
-        for row in (_COUNTED, _CAPTURES, _ONLY, _SET, *_RECEPTION, *_RUN):
+        for row in (_COUNTED, _CAPTURES, _OVER, _ONLY, _SET, *_RECEPTION, *_RUN):
             command = options(row)(command)
         return click.command(name, help=scenarios()[name].about, short_help=scenarios()[name].about)(command)
 
@@ -86,11 +87,19 @@ def _chosen(
 def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given: Any) -> int:
     name, out = str(context.info_name), given["out"]
     scenario = _chosen(name, given["captures"], given["only"], given["fields"], given["ways"])
+    if given["over"]:
+        if scenario.draw != "capture":
+            raise click.BadParameter(f"{name} receives no files of yours", param_hint="--over")
+        labels = labels_by_field(scenario.points, given["captures"], given["over"])
+        scenario = msgspec.structs.replace(scenario, columns=measures.BY_FIELD)
     run = _begin(name, out, given["jobs"], given["quiet"])
     more = {"save": str(given["save"])} if given["save"] else {}
     count = given["count"] or scenario.count
     tasks = scenario.tasks(given["seed"], count, out / "media", cae=given["cae"], **more)
     records = run(tasks, name, alone=scenario.alone)
+    if given["over"]:
+        files = {record["about"]["file"]: record for record in records}
+        records = [{**files[file], "groups": [label]} for file, label in labels.items()]
     rows = measures.rows(records, scenario.ways, scenario.all_columns, scenario.beside)
     odd = measures.worth_a_look(records, scenario.ways)
     click.echo(tables.titled([(scenario.about, rows), *([("worth a look", odd)] if odd else [])]))
@@ -104,10 +113,10 @@ def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given
         for weights in details["weights"].values():
             click.echo("likeliest weights of the features: " + " ".join(f"{weight:+.3f}" for weight in weights))
         tables.plot(bins, out / f"{name}-bins.png", "error_free", "interval95", "confidence")
-    points = [row for row in rows if row["scenes"] in scenario.points]
-    for measure in ("ber", "share"):
+    points = [row for row in rows if row["scenes"] in scenario.points or (given["over"] and row["scenes"] != "all")]
+    for measure in ("ber", "share", "lost_share", "kbps"):
         if points and f"{measure}95" in points[0]:
-            tables.plot(points, out / f"{name}.png", measure, f"{measure}95")
+            tables.plot(points, out / f"{name}-{measure}.png", measure, f"{measure}95")
     written = tables.write_outputs(out, name, rows, details)
     plotted = measures.error_over_time(records, scenario.ways) if scenario.draw == "capture" else {}
     if plotted and all(plotted.values()):

@@ -23,7 +23,7 @@ from rxcli.lab.benchmark.cases import Case, received
 from rxcli.lab.benchmark.draw import Place, binned, draw_nodata
 from rxcli.lab.benchmark.measures import Group, cluster_interval, wilson
 from rxcli.lab.benchmark.media import bare_decode, write_known
-from rxcli.lab.benchmark.runner import Run, Task, do, load_journal, scenarios
+from rxcli.lab.benchmark.runner import Run, Task, do, labels_by_field, load_journal, scenarios
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import receiver_options
@@ -310,6 +310,34 @@ def test_error_against_run_time_of_files_is_drawn(tmp_path: Path) -> None:
     assert "<svg" in svg.read_text()
 
 
+def test_files_are_counted_over_a_field_in_its_order(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png", "c.png"):
+        write_frame(tmp_path / name, 1)
+    with pytest.raises(UsageError, match=r"a\.png: neither a CSV beside it nor its metadata states 'distance_m'"):
+        labels_by_field(["a.png"], tmp_path, "distance_m")
+    (tmp_path / "f.csv").write_text("file,distance_m,light\na.png,10,lamp\nb.png,9.5,sun\nc.png,9.5,lamp\n")
+    assert labels_by_field(["a.png", "b.png", "c.png"], tmp_path, "distance_m") == {
+        "b.png": "distance_m 9.5",
+        "c.png": "distance_m 9.5",
+        "a.png": "distance_m 10",
+    }
+    assert list(labels_by_field(["b.png", "a.png"], tmp_path, "light").values()) == ["light lamp", "light sun"]
+    assert labels_by_field(["a.png"], tmp_path, "orientation") == {"a.png": "orientation 1"}
+
+
+def test_lost_packets_and_goodput_have_intervals() -> None:
+    still, clip = _record("sky"), _record("sea")
+    clip["ways"]["receiver"]["seconds"] = 0.5
+    row = measures.rows([still, clip], ["receiver"], ["lost_share", "lost_share95", "kbps", "kbps95"])[-1]
+    score = clip["ways"]["receiver"]["score"]
+    kbps = score["bits"] / 500
+    assert row["kbps"] == pytest.approx(kbps * score["error_free"] / score["expected"])
+    assert row["kbps95"][0] < row["kbps"] < row["kbps95"][1] < kbps
+    assert row["lost_share"] == pytest.approx(score["lost"] / score["expected"])
+    assert row["lost_share95"][0] < row["lost_share"] < row["lost_share95"][1]
+    assert "kbps" not in measures.rows([still], ["receiver"], ["kbps", "kbps95"])[-1]
+
+
 def test_the_headline_puts_receiver_and_yardsticks_side_by_side() -> None:
     record = _record("sky")
     record["ways"]["paper"] = record["ways"]["bound"]
@@ -395,6 +423,7 @@ def test_a_way_alone_is_compared_with_none(tmp_path: Path) -> None:
         (["films", "--set", "exposure_slots=nope"], "exposure_slots"),
         (["films", "--set", 'films=["nope"]'], "films"),
         (["films", "--set", "?"], "not FIELD=VALUE"),
+        (["films", "--over", "distance"], "receives no files"),
         (["speed", "--set", "n_frames=3"], "draws no population"),
     ],
 )

@@ -216,6 +216,8 @@ def received(case: Case, way: str) -> Record:
     return {
         "cpu_s": cpu_s,
         "wall_s": wall_s,
+        # Of a clip, its last frame included.
+        "seconds": results[-1].time_s * len(results) / (len(results) - 1) if len(results) > 1 else None,
         "stages_ms": dict(stages_ms),
         "mb": peak_memory_mb(),
         "kernel": os.environ.get("OPENBLAS_CORETYPE"),

@@ -136,6 +136,17 @@ def _ber_interval(group: Group) -> tuple[float, float]:
     return min(by_frame[0], by_packet[0]), max(by_frame[1], by_packet[1])
 
 
+def _goodput(group: Group) -> tuple[float, float, float] | None:
+    """Kilobits a second of clips in packets without a wrong bit, and the ends of its interval."""
+    clips = [case for case in group.cases if case["ways"][group.way].get("seconds")]
+    score = Group(clips, group.way, group.reference).score
+    if not score.expected:
+        return None
+    kbps = score.bits / 1e3 / sum(case["ways"][group.way]["seconds"] for case in clips)
+    low, high = wilson(score.error_free, score.expected)
+    return kbps * score.error_free / score.expected, kbps * low, kbps * high
+
+
 def _of_plain(group: Group) -> float:
     """Right packets of a case on average, over those of the table's first row."""
     plain = Group(group.plain, group.way, group.reference).score.error_free / len(group.plain)
@@ -179,6 +190,10 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "ber": lambda g: g.score.ber,
     "ber95": _ber_interval,
     "lost": lambda g: g.score.lost,
+    "lost_share": lambda g: g.score.lost / g.score.expected if g.score.expected else None,
+    "lost_share95": lambda g: wilson(g.score.lost, g.score.expected),
+    "kbps": lambda g: (_goodput(g) or (None,))[0],
+    "kbps95": lambda g: (_goodput(g) or ())[1:] or None,
     # The genie decides whatever it sees, sure or not.
     "false": lambda g: None if g.way == "bound" or not g.scores else g.score.false,
     "packets": lambda g: len(g.packets),
@@ -226,6 +241,7 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "of_visible": _transfers("of_visible", np.mean),
 }
 COMMON = ("n", "expected", "right", "share", "false", "sure", "surely_wrong", "at_most", "calibration", "problems")
+BY_FIELD = ("n", "expected", "right", "false", "ber", "ber95", "lost_share", "lost_share95", "kbps", "kbps95")
 COMMON_COST = ("cpu_s", "over_bare", "mb")
 
 

@@ -1,19 +1,21 @@
 """The one runner: draws the cases of a scenario, receives each in every way, and keeps a journal of it."""
 
+import csv
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from hashlib import sha256
+from math import inf
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from rxcli.errors import InputError
-from rxcli.ingest import KNOWN_SUFFIXES
+from rxcli.errors import InputError, UsageError
+from rxcli.ingest import KNOWN_SUFFIXES, open_source
 from rxcli.lab.benchmark import goodput
 from rxcli.lab.benchmark.cases import TWIN, Case, Record, arguments_of, bare, received, write_case
 from rxcli.lab.benchmark.draw import DRAWERS, Place
@@ -79,6 +81,28 @@ def capture_points(folder: Path | None) -> dict[str, dict[str, Any]]:
     """The photographs and clips of a folder as points, by name; None: the samples."""
     paths = sorted((folder or data_dir("sample_frames")).resolve().iterdir())
     return {path.name: {"path": str(path)} for path in paths if path.suffix.lower() in KNOWN_SUFFIXES}
+
+
+def labels_by_field(names: Iterable[str], folder: Path | None, field: str) -> dict[str, str]:
+    """File -> value of a field, in its order: of a column of a CSV beside the captures, or of their metadata.
+
+    Raises:
+        UsageError: neither states it of a file.
+    """
+    place, stated, found = folder or data_dir("sample_frames"), dict[str, Any](), []
+    for path in sorted(place.glob("*.csv")):
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            stated |= {row["file"]: row.get(field) for row in csv.DictReader(file) if row.get("file")}
+    for name in names:
+        value = stated.get(name) or getattr(next(iter(open_source(place / name))).metadata, field, None)
+        if value is None:
+            reason = f"{place / name}: neither a CSV beside it nor its metadata states {field!r}"
+            raise UsageError(reason, f"write {place / 'fields.csv'} with the columns file and {field}")
+        try:
+            found.append((float(value), f"{field} {float(value):g}", name))
+        except (TypeError, ValueError):
+            found.append((inf, f"{field} {value}", name))
+    return {name: label for _, label, name in sorted(found)}
 
 
 def do(task: Task) -> list[Record]:

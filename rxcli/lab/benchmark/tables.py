@@ -74,7 +74,7 @@ def plot(rows: Sequence[Row], path: Path, measure: str, interval: str, across: s
     Args:
         rows: the table.
         path: of the PNG.
-        measure: a column between 0 and 1.
+        measure: a column, between 0 and 1 but for `kbps`.
         interval: the column of its intervals.
         across: the column along the other axis.
     """
@@ -94,7 +94,7 @@ def plot(rows: Sequence[Row], path: Path, measure: str, interval: str, across: s
     axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
     if measure == "ber":
         axes.set_yscale("symlog", linthresh=1e-5)
-    axes.set(ylabel=measure, ylim=(0, 1))
+    axes.set(ylabel=measure, ylim=(0, None if measure == "kbps" else 1))
     axes.legend(fontsize=8)
     figure.savefig(path, dpi=130)
 
