@@ -248,15 +248,15 @@ def _check_ours(output: Output, step: str = "name another file, or replace it wi
 
 
 @contextmanager
-def replacing(path: Path, follow: bool = True) -> Iterator[Path]:
+def replacing(path: Path, follow: bool = True, kept_mode: int = 0o777) -> Iterator[Path]:
     """Yield a path of the same name in a new private folder, whose file replaces `path` if the block succeeds.
 
-    The file keeps the permissions of the one that it replaces, but no set-uid bit. If the block fails, `path` is
-    unchanged.
+    The file keeps permissions of the one that it replaces. If the block fails, `path` is unchanged.
 
     Args:
         path: the output.
         follow: write to the device, to the pipe, or to the target of the link that `path` is; otherwise replace it.
+        kept_mode: permissions that are kept; never a set-uid bit.
 
     Raises:
         UsageError, OutputError: the file cannot be written; any `OSError` of the block ends so.
@@ -272,7 +272,7 @@ def replacing(path: Path, follow: bool = True) -> Iterator[Path]:
             with suppress(FileNotFoundError):
                 mode = target.lstat().st_mode
                 if stat.S_ISREG(mode):
-                    hidden.chmod(mode & 0o777)
+                    hidden.chmod(mode & kept_mode)
             hidden.replace(target)
     except BrokenPipeError:
         raise
@@ -280,14 +280,14 @@ def replacing(path: Path, follow: bool = True) -> Iterator[Path]:
         raise unwritable(path, error) from None
 
 
-def write_whole(path: Path, content: str | bytes, follow: bool = True) -> None:
+def write_whole(path: Path, content: str | bytes, follow: bool = True, kept_mode: int = 0o777) -> None:
     """Write a file atomically; arguments as of `replacing`.
 
     Raises:
         OutputError: it cannot be written.
     """
     data = content.encode() if isinstance(content, str) else content
-    with replacing(path, follow) as hidden:
+    with replacing(path, follow, kept_mode) as hidden:
         hidden.write_bytes(data)
 
 

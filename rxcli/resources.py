@@ -5,7 +5,9 @@ The user's own files are in the system's folder for them (`platformdirs`), or in
 
 import errno
 import os
+import re
 import stat
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,12 @@ def data_dir(name: str) -> Path:
     """The folder `name` ("calibration", "models", "pages" or "sample_frames") of this installation."""
     installed = _PACKAGE / "_data" / name
     return installed if installed.is_dir() else _PACKAGE.parent / name
+
+
+def filled_page(name: str, parts: Mapping[str, object]) -> str:
+    """A page of this installation with `{{part}}` replaced; what a part holds is left as it is."""
+    text = (data_dir("pages") / name).read_text(encoding="utf-8")
+    return re.sub(r"\{\{([\w.]+)\}\}", lambda found: str(parts[found[1]]), text)
 
 
 def read_limited(path: Path, max_bytes: int) -> bytes:

@@ -202,6 +202,16 @@ def test_a_received_file_replaces_what_is_there_and_is_not_written_into_it(kind:
     assert (path.read_bytes(), victim.read_text()) == (b"sent", there)
 
 
+@pytest.mark.parametrize("mode", [0o755, 0o4711, 0o640])
+def test_a_received_file_may_not_be_executed(tmp_path: Path, mode: int) -> None:
+    """Though it replaces a program: whoever sends chooses name and content."""
+    (tmp_path / "tool").write_text("a program")
+    (tmp_path / "tool").chmod(mode)
+    save_object(ReceivedObject("tool", b"sent", 4, "00", 1, 1, "", 0, 0.0), tmp_path, force=True)
+    assert (tmp_path / "tool").read_bytes() == b"sent"
+    assert (tmp_path / "tool").stat().st_mode & 0o7777 == mode & 0o666
+
+
 def test_a_pipe_with_the_name_of_a_tap_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.jpg-000000.npz")
     with pytest.raises(UsageError, match="is no file"):

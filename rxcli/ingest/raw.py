@@ -51,9 +51,11 @@ def read_raw(path: Path) -> Frame:
     except (rawpy.LibRawError, RuntimeError, OSError, MemoryError, ValueError) as error:
         reason = f"{path}: the RAW file is damaged or cut ({_libraw_reason(error)})"
         raise InputError(reason, "copy the file again") from None
-    check_size(path, raw.sizes.width, raw.sizes.height)
     top, left, height, width = default_crop(raw.sizes)
     pixels = image[top : top + height, left : left + width]
+    if min(pixels.shape[:2]) < _PERIODS[-1]:
+        reason = f"{path}: the picture is {pixels.shape[1]} x {pixels.shape[0]} pixels"
+        raise InputError(reason, "the file is damaged; copy it again")
     metadata = _metadata(path, raw)
     if pixels.ndim != 2 or raw.num_colors == 1:
         return _linear_frame(path, pixels, raw, metadata)
@@ -101,25 +103,29 @@ def _unsupported(path: Path) -> tuple[str, str]:
 
 
 def _mosaic(raw: Any, top: int, left: int, path: Path) -> Mosaic:
-    colours, levels = _channel_colours(raw, path), np.array(raw.black_level_per_channel, np.float64)
+    colours = _channel_colours(raw, path)
+    levels = np.array(raw.black_level_per_channel[: colours.size], np.float64)
     red, green, blue = (float(levels[colours == colour].mean()) for colour in range(3))
-    white = _white(raw, max(red, green, blue))
-    return Mosaic(_pattern(raw, colours, top, left), _gains(raw), (red, green, blue), white)
+    white = _white(raw, max(red, green, blue), path)
+    return Mosaic(_pattern(raw, colours, top, left, path), _gains(raw), (red, green, blue), white)
 
 
 def _channel_colours(raw: Any, path: Path) -> NDArray[np.uint8]:
-    """(4,) colour (0 red, 1 green, 2 blue) of LibRaw's channels; a Bayer mosaic has two green ones."""
+    """Colour (0 red, 1 green, 2 blue) of LibRaw's three or four channels; a Bayer mosaic has two green ones."""
     colours = ["RGB".find(chr(letter)) for letter in raw.color_desc[:4]]
-    if min(colours) < 0:
+    if {*colours} != {0, 1, 2}:
         named = raw.color_desc.decode("ascii", "replace")
         raise InputError(f"{path}: the sensor's colours are {named}, not red, green and blue", "use the JPEG")
     return np.array(colours, np.uint8)
 
 
-def _pattern(raw: Any, colours: NDArray[np.uint8], top: int, left: int) -> NDArray[np.uint8]:
+def _pattern(raw: Any, colours: NDArray[np.uint8], top: int, left: int, path: Path) -> NDArray[np.uint8]:
     """The smallest tile whose repetition gives the colours from sensor pixel (top, left) on."""
     side = range(2 * _PERIODS[-1])
-    probe = np.array([[colours[raw.raw_color(top + y, left + x)] for x in side] for y in side], np.uint8)
+    channels = np.array([[raw.raw_color(top + y, left + x) for x in side] for y in side])
+    if channels.max() >= colours.size:
+        raise InputError(f"{path}: the RAW file's mosaic has colours that it does not name", "copy the file again")
+    probe: NDArray[np.uint8] = colours[channels]
     for period in _PERIODS:
         if (probe[period:] == probe[:-period]).all() and (probe[:, period:] == probe[:, :-period]).all():
             return probe[:period, :period].copy()
@@ -136,10 +142,13 @@ def _gains(raw: Any) -> tuple[float, float, float]:
     return 1.0, 1.0, 1.0
 
 
-def _white(raw: Any, black: float) -> float:
+def _white(raw: Any, black: float, path: Path) -> float:
     """The lowest level at which a channel saturates, as far as the file states it."""
-    levels = [float(level) for level in raw.camera_white_level_per_channel or () if level > black]
-    return min([*levels, float(raw.white_level) if raw.white_level > black else float(np.iinfo(np.uint16).max)])
+    levels = [float(level) for level in (*(raw.camera_white_level_per_channel or ()), raw.white_level) if level > black]
+    white = min(levels, default=float(np.iinfo(np.uint16).max))
+    if black >= white:
+        raise InputError(f"{path}: the RAW file states a black level of {black:g}", "copy the file again")
+    return white
 
 
 def _linear_frame(path: Path, pixels: NDArray[np.uint16], raw: Any, metadata: Metadata) -> Frame:
@@ -147,7 +156,7 @@ def _linear_frame(path: Path, pixels: NDArray[np.uint16], raw: Any, metadata: Me
     plane = pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[:, :, 1 if pixels.shape[2] >= 3 else 0])
     plane.flags.writeable = False
     black = float(raw.black_level_per_channel[1 if pixels.ndim == 3 else 0])
-    return Frame(plane, str(path), metadata=metadata, black=black, white=_white(raw, black), linear=True)
+    return Frame(plane, str(path), metadata=metadata, black=black, white=_white(raw, black, path), linear=True)
 
 
 def _metadata(path: Path, raw: Any) -> Metadata:

@@ -16,7 +16,8 @@ def save_object(
 ) -> ReceivedObject:
     """Write a complete file and return it with its path.
 
-    A partial file is never visible. An existing file of the same name and content is left as it is.
+    A partial file is never visible. An existing file of the same name and content is left as it is. What replaces a
+    program may not be executed.
 
     Args:
         received: the file.
@@ -36,7 +37,7 @@ def save_object(
         if os.path.lexists(path) and not force:
             step = "give --force to overwrite it, or another folder"
             raise InputError(f"{path} exists with other content; {lost}", step)
-        write_whole(path, received.data, follow=False)
+        write_whole(path, received.data, follow=False, kept_mode=0o666)
     taken.add(path, "a file received before")
     return replace(received, path=str(path))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from rxcli.errors import printable
 from rxcli.profiles import CameraProfile, ScreenProfile
-from rxcli.resources import data_dir
+from rxcli.resources import data_dir, filled_page
 from rxcli.results.aim import brightness_of, height_share, split_message
 from rxcli.results.columns import column_rows, packet_rows, text_rows
 from rxcli.results.inspection import Inspection, Trace, inspect_frame
@@ -80,14 +80,11 @@ def inspection_page(
 def fill(data: dict[str, Any], title: str) -> str:
     """The template with its style, scripts and data, so that the file needs no other."""
     pages = data_dir("pages")
-    text = (pages / "inspect.html").read_text(encoding="utf-8")
     parts = {"mark": MARK, "title": html.escape(title)}
     parts |= {name: (pages / name).read_text(encoding="utf-8") for name in ("app.css", "view.js", "inspect.js")}
     # As Unicode escapes, markup in the data is no markup of the page.
     parts["data"] = json.dumps(plain(data), separators=(",", ":")).replace("<", "\\u003c")
-    for name, part in parts.items():
-        text = text.replace("{{" + name + "}}", part, 1)
-    return text
+    return filled_page("inspect.html", parts)
 
 
 def _facts(frame: Frame, result: FrameResult) -> dict[str, str]:

@@ -32,7 +32,7 @@ from rxcli.errors import UsageError
 from rxcli.ingest.v4l2 import CameraSettings
 from rxcli.options import ReceiverOptions
 from rxcli.outputs import claim_folder
-from rxcli.resources import data_dir
+from rxcli.resources import data_dir, filled_page
 from rxcli.web.decoding import DecodingProcess, Limits, refusal
 
 log = logging.getLogger(__name__)
@@ -352,10 +352,9 @@ class Server:
     # -- addresses ----------------------------------------------------------------------------------------------------
 
     async def _index(self, request: web.Request) -> web.Response:
-        text, site = (_PAGE / "index.html").read_text(encoding="utf-8"), self._site
+        site = self._site
         retention, live = "not kept" if site.keep is None else "kept", "no" if site.device is None else "yes"
-        for name, value in {"kept": retention, "live": live, "largest": site.bounds.upload_bytes}.items():
-            text = text.replace("{{" + name + "}}", str(value))
+        text = filled_page("index.html", {"kept": retention, "live": live, "largest": site.bounds.upload_bytes})
         return web.Response(text=text, content_type="text/html")
 
     async def _with_slash(self, request: web.Request) -> web.Response:
@@ -586,5 +585,6 @@ def _suffix(path: Path) -> str:
     """Suffix of a stored upload, from its content and never from its name."""
     from rxcli.ingest.sniff import HEAD_BYTES, read_bytes, sniff
 
-    kinds = {"jpeg": ".jpg", "png": ".png", "tiff": ".tif", "heif": ".heic", "raw": ".raw", "video": ".mp4"}
-    return kinds.get(sniff(read_bytes(path, HEAD_BYTES), "") or "", ".bin")
+    kinds = {"jpeg": ".jpg", "tiff": ".tif", "heif": ".heic", "video": ".mp4", "other_image": ".bin"}
+    kind = sniff(read_bytes(path, HEAD_BYTES), "") or "bin"
+    return kinds.get(kind, f".{kind}")

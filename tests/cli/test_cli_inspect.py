@@ -55,6 +55,17 @@ def test_a_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFi
     assert data["maps"]
 
 
+@pytest.mark.parametrize("name", ["{{data}}", "{{view.js}}", "{{mark}}{{app.css}}", "{{nothing}}"])
+def test_a_name_that_looks_like_a_part_of_the_page_is_a_name(name: str, tmp_path: Path) -> None:
+    write_frame(tmp_path / f"{name}.png", 1)
+    out = tmp_path / "page"
+    assert run(["inspect", str(tmp_path / f"{name}.png"), "--out", str(out), *write_profiles(tmp_path)]) == 0
+    page = (out / "index.html").read_text()
+    assert f"<title>{name}.png: " in page
+    assert page.count('id="data"') == page.count("<style>") == 1
+    assert name in shown(out / "index.html")["source"]
+
+
 @pytest.mark.parametrize("width", [390, 1280])
 def test_the_page_draws_all_sections_in_a_browser(width: int, tmp_path: Path) -> None:
     pytest.importorskip("aiohttp")

@@ -16,7 +16,7 @@ from PIL import Image
 
 from rxcli.errors import InputError
 from rxcli.ingest.metadata import raw_metadata
-from rxcli.ingest.raw import default_crop
+from rxcli.ingest.raw import _mosaic, default_crop
 from rxcli.types import Frame, Mosaic
 
 HEIGHT, WIDTH = 300, 400
@@ -176,3 +176,33 @@ def test_a_capture_with_an_xtrans_mosaic(shared_captures: Path) -> None:
     np.testing.assert_array_equal(mosaic.pattern, XTRANS)
     assert (mosaic.black, mosaic.white) == ((1022, 1022, 1022), 16383)
     assert frame.metadata.model == "xs10"
+
+
+@pytest.mark.parametrize(
+    ("tags", "reason"),
+    [
+        ([(50719, "I", 2, (0, 0), True), (50720, "I", 2, (9, 200), True)], "the picture is 9 x 200 pixels"),
+        ([(50714, "H", 1, 65535, True)], "a black level of 65535"),
+    ],
+)
+def test_changed_tags_are_refused(
+    tags: list[tuple[Any, ...]], reason: str, tmp_path: Path, noise: NDArray[np.uint16]
+) -> None:
+    """They ended in internal errors of the receiver."""
+    with pytest.raises(InputError, match=reason):
+        one_frame(write_dng(tmp_path / "a.dng", noise, BAYER, *tags))
+
+
+@pytest.mark.parametrize(
+    ("names", "channels"), [(b"RGB", (0, 1, 2, 3)), (b"RGRG", (0, 1, 2, 3)), (b"RGBG", (0, 1, 2, 7))]
+)
+def test_colours_that_a_file_does_not_name_are_refused(names: bytes, channels: tuple[int, ...]) -> None:
+    raw = SimpleNamespace(
+        raw_color=lambda y, x: channels[2 * (y % 2) + x % 2],
+        color_desc=names,
+        black_level_per_channel=[0] * 4,
+        white_level=4000,
+        camera_white_level_per_channel=None,
+    )
+    with pytest.raises(InputError, match="colours"):
+        _mosaic(raw, 0, 0, Path("a.dng"))

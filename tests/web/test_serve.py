@@ -227,7 +227,10 @@ def test_who_may_ask(options: ReceiverOptions) -> None:
 
     async def local(server: Server, client: Any) -> None:
         assert await status(client, server.address) == 200
-        assert await status(client, server.address, headers={"Host": "evil.example"}) == 403
+        for host in ("evil.example", "localhost:http", "localhost:80:80", "localhost:8x", "a@localhost"):
+            assert await status(client, server.address, headers={"Host": host}) == 403, host
+        for host in ("localhost", "localhost:80", "127.0.0.1:80", "[::1]:80"):
+            assert await status(client, server.address, headers={"Host": host}) == 200, host
         assert await status(client, server.address, headers={"Origin": "http://evil.example"}) == 403
         visit = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "document"}
         assert await status(client, server.address, headers=visit) == 200  # a link on another page

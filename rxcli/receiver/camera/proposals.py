@@ -128,7 +128,8 @@ def _strongest_line(
     columns = columns_of(straightened(strips, level, curvature), strips.n_columns)
     line, n_rows = _slot_line(columns), columns.shape[1]
     low, high = (int(_FINE * n_rows / rows) for rows in reversed(_slot_range(width, strips.pitch)))
-    (place,) = low + _peaks(line[low : high + 2], 1, 1) if high > low + 2 else (0.0,)
+    peaks = low + _peaks(line[low : high + 2], 1, 1) if high > low + 2 else np.zeros(0)
+    place = peaks[0] if peaks.size else 0.0  # where there is no light, there is none
     return (_FINE * n_rows / place * strips.pitch, float(line[round(place)])) if place > 0 else (width, 0.0)
 
 

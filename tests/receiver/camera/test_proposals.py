@@ -21,6 +21,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, dump_profile, load_profile, usual_screens
 from rxcli.receiver import camera as blind
 from rxcli.receiver import plane
+from rxcli.receiver.camera import proposals
 from rxcli.receiver.camera.proposals import stripe_rows
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.light import NoiseModel
@@ -249,6 +250,14 @@ def test_pictures_without_stripes_propose_nothing() -> None:
     noise = _flat_strips(rng.normal(0.3, 0.002, (40, 400)))
     assert not blind.propose(noise, SCREENS)
     assert not blind.propose_slots(noise)
+
+
+def test_a_spectrum_without_a_peak_proposes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of small pictures: it falls over all rates that slots may have."""
+    light = _striped(np.random.default_rng(1), 400)
+    assert blind.propose_slots(_flat_strips(light))
+    monkeypatch.setattr(proposals, "_slot_line", lambda columns: 1 / (1.0 + np.arange(50 * columns.shape[1])))
+    assert not blind.propose_slots(_flat_strips(light))
 
 
 def test_rows_against_the_readout_are_turned_and_back() -> None:
