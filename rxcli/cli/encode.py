@@ -93,15 +93,16 @@ def _plan(path: Path | None, screen: ScreenProfile, options: dict[str, Any]) -> 
     if options["payload"] is None:
         sending = sending_of(*given, _RATES[options["mother"]], options["object_id"])
         n_bursts = _n_bursts(options, sending, screen)
-        weights = _weights(options["weights"], n_bursts, screen.columns)
+        weights = _weights(options["weights"], screen.columns, n_bursts)
         for row in weights:
             sending.check(row, screen.payload_symbols)
         return _Plan(sending, screen, weights, n_bursts, options["only_column"])
     is_both = any(value is not None for value in given)
     refuse((is_both, "--payload excludes PATH, --text and --uri", "give one of them"))
-    weights = _weights(options["weights"], 1, screen.columns)
-    raw = raw_sending(options["payload"], weights[0], options["seed"], options["same"])
-    return _Plan(raw, screen, weights, _n_bursts(options, raw, screen), options["only_column"])
+    weights = _weights(options["weights"], screen.columns)
+    raw = raw_sending(options["payload"], weights, options["seed"], options["same"])
+    n_bursts = _n_bursts(options, raw, screen)
+    return _Plan(raw, screen, _weights(options["weights"], screen.columns, n_bursts), n_bursts, options["only_column"])
 
 
 def _write_slots(plan: _Plan, out: Path, suffix: str) -> None:
@@ -126,20 +127,20 @@ def _n_bursts(options: dict[str, Any], sending: Sending | TestLight, screen: Scr
     return sending.usual_bursts(screen.columns, screen.payload_symbols)
 
 
-def _weights(text: str, n_bursts: int, columns: int) -> NDArray[np.int64]:
+def _weights(text: str, columns: int, n_bursts: int | None = None) -> NDArray[np.int64]:
     """(n_bursts or 1, columns) weights."""
     try:
         values = np.asarray(_weight_values(text), np.int64)
         weights = np.broadcast_to(values, (values.shape[0] if values.ndim == 2 else 1, columns))
     except (ValueError, TypeError, OverflowError):
         raise UsageError(
-            f"--weights {text}: no number, list of {columns} numbers, or JSON file of {n_bursts} such lists",
+            f"--weights {text}: no number, list of {columns} numbers, or JSON file of such lists",
             "give 1..9 for every column",
         ) from None
     n, step = len(weights), f"give {n_bursts}, or --bursts"
     refuse(
         (weights.min() < 1 or weights.max() > 9, f"--weights {text}: weights are 1 to 9", "choose from 1..9"),
-        (n not in (1, n_bursts), f"--weights {text} holds {n} bursts, {n_bursts} are sent", step),
+        (n not in (1, n_bursts or n), f"--weights {text} holds {n} bursts, {n_bursts} are sent", step),
     )
     return weights
 

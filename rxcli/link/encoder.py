@@ -185,7 +185,7 @@ class RawSending:
 
     #: What is sent; None for random bits, or for a counter.
     content: bytes | None
-    #: (C,) lit slots of ten.
+    #: (n, C) lit slots of ten in bursts that take turns.
     weights: NDArray[np.int64]
     #: Seed of random bits; None: the number of the burst in 16 bits, over and over, in every column.
     seed: int | None = 0
@@ -196,17 +196,18 @@ class RawSending:
         """(n, N, C) uint8 labels of bursts `bursts` (n,)."""
         out = np.empty((len(bursts), payload_symbols, columns), np.uint8)
         for place, burst in enumerate(bursts.tolist()):
-            for column, bits in enumerate(self._payload(burst, payload_symbols)):
-                w = int(self.weights[column])
+            for column, (bits, w) in enumerate(zip(self._payload(burst, payload_symbols), self._w(burst), strict=True)):
                 out[place, :, column] = bits_to_indices(bits, w) << (LABEL_BITS - bits_per_symbol(w))
         return out
 
     def _payload(self, burst: int, payload_symbols: int) -> list[NDArray[np.uint8]]:
         """Payload bits of a burst, by column."""
-        sizes = [payload_symbols * bits_per_symbol(int(w)) for w in self.weights]
-        total = self._burst_bits(payload_symbols)
+        sizes = [payload_symbols * bits_per_symbol(w) for w in self._w(burst)]
+        total = self._burst_bits(burst, payload_symbols)
         if self.content is not None:
-            bits = np.take(_bits(self.content), np.arange(burst * total, (burst + 1) * total), mode="wrap")
+            turns = [self._burst_bits(turn, payload_symbols) for turn in range(len(self.weights))]
+            start = burst // len(turns) * sum(turns) + sum(turns[: burst % len(turns)])
+            bits = np.take(_bits(self.content), np.arange(start, start + total), mode="wrap")
         elif self.seed is not None:
             rng = np.random.Generator(np.random.Philox(np.random.SeedSequence([self.seed, burst])))
             bits = rng.integers(0, 2, total, dtype=np.uint8)
@@ -215,16 +216,19 @@ class RawSending:
             return [np.resize(number, size) for size in sizes]
         return [bits[:size] for size in sizes] if self.same else np.split(bits, np.cumsum(sizes)[:-1])
 
-    def _burst_bits(self, payload_symbols: int) -> int:
+    def _w(self, burst: int) -> list[int]:
+        return [int(w) for w in self.weights[burst % len(self.weights)]]
+
+    def _burst_bits(self, burst: int, payload_symbols: int) -> int:
         """Different bits of a burst."""
-        bits = [payload_symbols * bits_per_symbol(int(w)) for w in self.weights]
+        bits = [payload_symbols * bits_per_symbol(w) for w in self._w(burst)]
         return max(bits) if self.same else sum(bits)
 
     def usual_bursts(self, columns: int, payload_symbols: int) -> int:
         """Bursts after which the payload begins anew; of random bits and a counter some."""
-        if self.content is None:
-            return _RAW_BURSTS
-        return -(-8 * len(self.content) // self._burst_bits(payload_symbols))
+        if self.content is None or len(self.weights) > 1:
+            return _RAW_BURSTS if len(self.weights) == 1 else len(self.weights)
+        return -(-8 * len(self.content) // self._burst_bits(0, payload_symbols))
 
     @property
     def summary(self) -> str:

@@ -177,6 +177,20 @@ def test_raw_payload_is_what_the_simulator_sends(tmp_path: Path, content: str) -
     assert truth.payload_bits == tuple(link.bits_per_column())
 
 
+@pytest.mark.parametrize("content", ["hex:0123456789abcdef", "random"])
+def test_weights_of_raw_payload_may_change_from_burst_to_burst(tmp_path: Path, content: str) -> None:
+    screen, out, weights = load_profile("paper-8k65", ScreenProfile), tmp_path / "s.npy", tmp_path / "w.json"
+    weights.write_text(json.dumps([[5] * 20, [2] * 20]))
+    assert encode("--payload", content, "--screen", "paper-8k65", "--weights", weights, "--out", out) == ExitCode.OK
+    slots = read_slots(out, screen).reshape(2, 3, 7, 10, 20)
+    assert np.unique(slots[0, :, 2:].sum(axis=2)).tolist() == [5]
+    assert np.unique(slots[1, :, 2:].sum(axis=2)).tolist() == [2]
+    if content != "random":  # The second burst goes on where the first ends.
+        bits = np.unpackbits(np.frombuffer(bytes.fromhex(content[4:]), np.uint8))
+        sent = [codebook(2).tolist().index(row) for row in slots[1, 0, 2:, :, 0].tolist()]
+        assert "".join(f"{index:05b}" for index in sent) == "".join(map(str, np.resize(bits, 725)[700:]))
+
+
 @pytest.mark.parametrize(
     ("what", "lit"),
     [(("counter",), None), (("hex:cafe", "--same"), None), (("lit",), 4), (("half",), 2), (("random",), None)],

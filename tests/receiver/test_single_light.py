@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -93,3 +94,31 @@ def test_a_few_lit_columns_side_by_side_are_no_single_lamp() -> None:
     trial = simulate_trial(replace(preset("xs10-still", "paper-17k3").scaled(0.4, 1.0), picture="flower"), 1)
     (result,) = receive([trial.frame], trial.options())
     assert len(result.packets) >= 5
+
+
+def test_a_screen_of_two_columns_is_received() -> None:
+    """Where it fills a part of the picture, and where less than its two columns are in view: which is no bug."""
+    scene = preset("phone-plain", "paper-8k65").scaled(0.3, 0.3, keep_readout=True)
+    two = msgspec.structs.replace(scene.screen, name="two", columns=2, width_mm=60.0, height_mm=60.0)
+    options = ReceiverOptions(screens=(two,))
+    for fill, n_received in ((0.7, 2), (3.0, 0)):
+        own = replace(scene, screen=two, picture="white", pose=replace(scene.pose, fill=fill))
+        (result,) = receive([simulate_trial(own, 1).frame], options)
+        assert len(result.packets) >= n_received
+
+
+def test_one_column_alone_has_no_number() -> None:
+    scene = preset("phone-plain", "paper-8k65").scaled(0.4, 0.4, keep_readout=True)
+    slots = np.random.default_rng(1).integers(0, 2, 70)
+    slots[:20] = [int(digit) for digit in "00111000111111100000"]
+    slots[20:] = np.tile([1, 0, 0, 1, 1, 0, 1, 0, 1, 0], 5)
+
+    def waveform(slot: NDArray[np.int64]) -> NDArray[np.float64]:
+        out = np.zeros((20, slot.size))
+        out[7] = slots[slot.astype(np.int64) % 70]
+        return out
+
+    trial = simulate_trial(replace(scene, waveform=waveform, picture="white").metered(0.9 / 8650), 1)
+    (result,) = receive([trial.frame], ReceiverOptions())
+    assert [remark.reason for remark in result.remarks] == ["one_column"]
+    assert len(result.packets) == 1

@@ -36,7 +36,9 @@ def named(result: FrameResult, options: ReceiverOptions) -> FrameResult:
         remark = Remark("all_the_same")
     else:
         return result
-    return replace(result, remarks=(*result.remarks, remark))
+    # The numbers of equal columns do not matter, and that of a column alone does not show.
+    remarks = tuple(known for known in result.remarks if known.reason != "column_numbers")
+    return replace(result, remarks=(*remarks, remark))
 
 
 def _is_one_column(result: FrameResult, screen: ScreenProfile) -> bool:

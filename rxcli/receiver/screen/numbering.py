@@ -37,6 +37,10 @@ _SIDE_SD = 0.0125
 _PAIRED = (0.22, 0.58)
 
 
+#: Columns that a picture shows of a screen, where it has as many.
+_MIN_SHOWN = 3
+
+
 #: Features of a first column in their order; the comments in `models/numbering/model.toml` explain them.
 WEIGHTS = (
     *("lit_inside", "unlit_inside", "steady_inside", "light_off_middle", "picture_off_middle", "hidden_unlit"),
@@ -164,7 +168,9 @@ def first_column_features(light: LightProfile, n_columns: int) -> tuple[IntArray
     """Columns (F,) of a grid, their features (F, 11) in the order of the weights, and whether no side is in view."""
     shown = light.place[light.in_picture]
     left, right = float(shown.min()), float(shown.max())
-    starts = np.arange(int(left) - n_columns + 3, int(right) - 2)
+    n_shown = min(n_columns, _MIN_SHOWN)
+    leftmost = int(left) - n_columns + n_shown
+    starts = np.arange(leftmost, max(int(right) - n_shown, leftmost) + 1)
     ends, middles = starts + n_columns, starts + n_columns / 2
     begin, end_of_light = light.ends
     reaches = np.array([begin < left + _IN_VIEW, end_of_light > right - _IN_VIEW])
