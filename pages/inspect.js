@@ -240,9 +240,10 @@
       const y = 24 * place, width = ((all - 180) * stages[name]) / most;
       return [label(96, 18 + y, name, "end"), bar(104, 6 + y, width, 16, "bar"), label(110 + width, 18 + y, `${stages[name].toFixed(0)} ms`)];
     });
-    const left = Object.entries(data.skipped).map(([name, n]) => `${name.replaceAll("_", " ")} ${n}`).join(", ");
+    const skipped = { no_screen: "packets, as there is no screen", no_packets: "refining, as there are no packets", dark_columns: "dark columns", certain_columns: "certain columns", tracking: "tracking" };
+    const left = Object.entries(data.skipped).map(([name, n]) => `${skipped[name] || name}${n > 1 ? ` (${n})` : ""}`).join(", ");
     section("Time", told, ...(names.length ? [svg(24 * names.length + 8, `Time by stage: ${told}`, bars, all, "small")] : []),
-      make("p", left ? `Left out because the picture did not need it: ${left}.` : "Nothing was left out."));
+      make("p", left ? `Left out: ${left}.` : "Nothing was left out."));
   }
 
   function drawAll() {

@@ -47,7 +47,7 @@ def lens_from_database(metadata: Metadata, width: int, height: int) -> LensfunMo
     try:
         import lensfunpy
     except ImportError:
-        raise UsageError("the lensfun database needs the package lensfunpy", "pip install '.[lensfun]'") from None
+        raise UsageError("the lensfun database needs the package lensfunpy", "pip install lensfunpy") from None
     focal_mm = metadata.focal_length_mm
     if not metadata.model or not focal_mm:
         hint = "give --camera-model, --lens and --focal-length"

@@ -159,7 +159,7 @@ def benchmark(context: click.Context, /, quick: bool, seed: int, **run: Any) -> 
 @options(("--repeats", _COUNT, 2, "Turns of each checkout; the least time of every file counts."))
 @options(_COUNTED, _CAPTURES, _ONLY, _OUT, _SEED, _QUIET)
 def compare(checkout: Path, name: str, out: Path, **given: Any) -> int:
-    """This checkout against CHECKOUT, an earlier one, on the cases of scenario NAME.
+    """Hold this checkout against CHECKOUT. The cases are those of scenario NAME.
 
     Exit code 1 where a result differs.
     """

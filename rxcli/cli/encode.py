@@ -48,7 +48,7 @@ _OUT_HELP = "Where to write: .npy or .csv; slots also as .bin, .h or .vcd; - for
     ("--seconds", POSITIVE, None, "How much time of the link, instead."),
     ("--slots", None, False, "Write the slots themselves instead of labels; so do --payload, .bin, .h and .vcd."),
     ("--truth", FILE, None, "Also write what is sent (JSON), for decode --truth."),
-    ("--weights", str, "5", "Lit slots of ten: N, a list N,N,..., or a JSON file per burst."),
+    ("--weights --w", str, "5", "Lit slots of ten: N, a list N,N,..., or a JSON file per burst."),
     ("--mother", tuple(_RATES), "1/3", "Mother rate of a file's code."),
     ("--object-id", click.IntRange(0, 65533), None, "Number of a file. [default: from its content]"),
 )

@@ -34,7 +34,7 @@ def profiles(context: click.Context) -> None:
 @_JSON
 @force_argument
 def list_profiles(json_path: str | None, force: bool) -> None:
-    """List the profiles that go by their names: the user's own and the shipped ones."""
+    """List the known profiles. They go by their names: the user's own and the shipped ones."""
     claim([json_output(json_path, "screens", "cameras")], force=force)
     known, listed = _known(), {"screens": list[Any](), "cameras": list[Any]()}
     for profile, origin, path in known:

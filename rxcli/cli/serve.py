@@ -42,7 +42,7 @@ def serve(device: Path | None, **options: Any) -> int:
     """
     for package in ("aiohttp", "segno"):
         if find_spec(package) is None:
-            raise UsageError(f"the page needs the package {package}", "pip install '.[web]'")
+            raise UsageError(f"the page needs the package {package}", f"pip install {package}")
     asyncio.run(_run(_site(device, options)))
     click.echo("stopped", err=True)
     return ExitCode.OK

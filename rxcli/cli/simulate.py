@@ -60,7 +60,7 @@ _LIST = {"is_eager": True, "expose_value": False, "callback": _list}
     ("--slots", FILE, None, "Send the slots that encode wrote to this file (.csv, .npy, .bin), over and over."),
     ("--seed", click.IntRange(0), 0, "Same seed, same pixels."),
     ("--format=NAME file_format", _FORMATS, None, f"Format of OUT, {', '.join(_FORMATS)}. [default: by its suffix]"),
-    ("--w weights", str, "5", "Lit slots of ten: N, a list N,N,..., or 'dimming'."),
+    ("--weights --w", str, "5", "Lit slots of ten: N, a list N,N,..., or 'dimming'."),
     ("--exposure exposure_s", Exposure(), None, "Exposure in seconds, or as 1/32000.  [default: the preset's]"),
     ("--exposure-slots", POSITIVE, None, "Exposure in slots; the gain follows, as in camera apps."),
     ("--readout readout_s", POSITIVE, None, "Seconds in which all rows are read."),
@@ -208,7 +208,7 @@ def _weights(text: str) -> Weights:
     try:
         values = tuple(int(part) for part in text.split(","))
     except ValueError:
-        raise UsageError(f"--w: {text!r} is no weight", "give 1..9, a list of them, or 'dimming'") from None
+        raise UsageError(f"--weights: {text!r} is no weight", "give 1..9, a list of them, or 'dimming'") from None
     return values[0] if len(values) == 1 else values
 
 

@@ -38,7 +38,7 @@ def train(out: Path, **options: Any) -> None:
     """
     for package in ("torch", "onnx", "matplotlib"):
         if find_spec(package) is None:
-            raise UsageError(f"training needs {package}, which is not installed", "run: pip install '.[train]'")
+            raise UsageError(f"training needs {package}, which is not installed", f"pip install {package}")
     from rxcli.outputs import claim_folder, claim_own_folder
 
     claim_folder("OUT", out)

@@ -33,7 +33,7 @@ def read_heif(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]
     try:
         import pillow_heif
     except ImportError:
-        raise InputError(f"{path}: HEIC needs an extra", "run `pip install '.[web]'`, or save as JPEG") from None
+        raise InputError(f"{path}: HEIC needs pillow-heif", "run `pip install pillow-heif`, or save as JPEG") from None
     with damage_explained(f"{path}: the HEIC picture is damaged", "copy the file again"):
         file = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
         orientation = _orientation(file[file.primary_index])

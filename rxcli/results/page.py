@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.errors import printable
+from rxcli.errors import capitalised, printable
 from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.resources import data_dir, filled_page
 from rxcli.results.aim import brightness_of, height_share, split_message
@@ -18,7 +18,7 @@ from rxcli.results.inspection import Inspection, Trace, inspect_frame
 from rxcli.results.maps import column_map
 from rxcli.results.overlay import picture_of, preview
 from rxcli.results.record import plain
-from rxcli.results.report import headline, mirror_note
+from rxcli.results.report import count_packets, headline, mirror_note, plural
 from rxcli.types import FloatArray, Frame, FrameResult
 
 #: First lines of a page that this program wrote.
@@ -49,13 +49,20 @@ def inspection_page(
     """
     known = inspect_frame(taps, result) if taps and result.columns else None
     reason, advice = split_message(result) if result.message else ("", "")
+    title, frame_note = headline(result), ""
+    if timeline:  # a clip is headed by what all its frames gave
+        packets = [packet for entry in timeline for packet in entry.packets]
+        n_received = sum(packet.is_believable for packet in packets)
+        frame_note = f"Frame {result.frame} is shown: {title.lower()}."
+        counted = count_packets(n_received, len(packets) - n_received)
+        title = capitalised(f"{counted}, {plural(len(timeline), 'frame')}")
     data = {
-        "headline": headline(result),
+        "headline": title,
         "source": printable(result.source),
         "steps": _steps(result),
-        "notes": [sentence for sentence in (mirror_note(result), reason) if sentence],
+        "notes": [sentence for sentence in (frame_note, mirror_note(result), reason) if sentence],
         "advice": advice,
-        "texts": text_rows(result),
+        "texts": [row for entry in timeline or [result] for row in text_rows(entry)],
         "facts": _facts(frame, result),
         "picture": picture_of(result, frame, preview(frame, _WIDTH_PX), screen, camera),
         "maps": [shown for shown in (column_map(frame, result, screen, camera),) if shown],
@@ -74,7 +81,7 @@ def inspection_page(
             [entry.hypothesis, entry.log_prior, entry.evidence, entry.score, entry.fate] for entry in result.search
         ],
     }
-    return fill(data, f"{printable(Path(result.source).name)}: {headline(result).lower()}")
+    return fill(data, f"{printable(Path(result.source).name)}: {title.lower()}")
 
 
 def fill(data: dict[str, Any], title: str) -> str:

@@ -299,7 +299,7 @@ def check_summary_path(path: Path) -> None:
         from importlib.util import find_spec
 
         if find_spec("pyarrow") is None:
-            raise UsageError(f"{path}: Parquet needs the package pyarrow", "pip install '.[parquet]', or name a .csv")
+            raise UsageError(f"{path}: Parquet needs the package pyarrow", "pip install pyarrow, or name a .csv")
 
 
 _COLUMNS = tuple(SourceSummary("").row(Limits()))

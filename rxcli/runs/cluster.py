@@ -87,7 +87,7 @@ def _connect(address: str, connect_s: float) -> Client:
     try:
         from distributed import Client
     except ImportError:
-        raise UsageError("--cluster needs the package distributed", "pip install '.[cluster]'") from None
+        raise UsageError("--cluster needs the package distributed", "pip install distributed") from None
     made: list[Client] = []
     failures: list[str] = []
 

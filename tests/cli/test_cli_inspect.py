@@ -117,7 +117,10 @@ def test_a_clip_has_a_timeline(tmp_path: Path) -> None:
     profile = str(samples / "video1080.toml")
     clip = str(samples / "video1080_chelsea_17k3.mp4")
     assert run(["inspect", clip, "--camera", profile, "--out", str(tmp_path)]) == 0
-    timeline = shown(tmp_path / "index.html")["timeline"]
+    page = shown(tmp_path / "index.html")
+    assert page["headline"] == "360 packets received, 24 frames"
+    assert re.fullmatch(r"Frame \d+ is shown: \d+ packets received\.", page["notes"][0])
+    timeline = page["timeline"]
     assert [len(timeline), sum(frame[3] for frame in timeline)] == [24, 360]
     assert all(frame[4] for frame in timeline)
 

@@ -34,6 +34,7 @@ def test_help_of_every_command_breaks_no_words_at_80_characters(
         assert max(map(len, lines)) <= 80, arguments
         assert not [line for line in lines if line.endswith("-") and line[-2:-1].isalpha()], arguments
         assert not any("\u2011" in line for line in lines)
+        assert not any(line.endswith("...") and "Usage:" not in line for line in lines), arguments
 
 
 def loaded_by(*arguments: str) -> set[str]:

@@ -274,3 +274,12 @@ def test_a_stream_that_takes_no_more(where: str, code: int, said: str) -> None:
     assert done.returncode == code
     assert said in done.stderr
     assert ("cannot be written" in done.stderr) == bool(said)
+
+
+def test_weights_go_by_one_name(tmp_path: Path) -> None:
+    """Of what is sent and of what is simulated; the short one stays."""
+    for flag in ("--weights", "--w"):
+        sent = tmp_path / f"{flag}.csv"
+        assert encode("--payload", "counter", "--screen", "paper-8k65", flag, 3, "--out", sent) == ExitCode.OK
+        photo = ("--preset", "phone-plain", "--screen", "paper-8k65", "--scale", 0.05, flag, 3)
+        assert run(["simulate", str(tmp_path / f"{flag}.png"), *map(str, photo)]) == ExitCode.OK

@@ -128,5 +128,5 @@ def plot_error_over_time(points: Mapping[str, Sequence[tuple[float, float]]], st
 
 def _can_plot() -> bool:
     if find_spec("matplotlib") is None:
-        log.warning("no plots: matplotlib is not installed (pip install '.[plot]')")
+        log.warning("no plots: matplotlib is not installed (pip install matplotlib)")
     return find_spec("matplotlib") is not None
