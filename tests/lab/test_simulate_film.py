@@ -144,8 +144,8 @@ def test_a_camera_mixes_frames_over_time_and_moves_their_rows() -> None:
     takes = [prepare(replace(plain, **fields), 5) for fields in ways]
     frames, mixed, recursive = ([picture.astype(float) for picture in take.pictures()] for take in takes)
     assert np.array_equal(mixed[0], frames[0])
-    assert mixed[2] == pytest.approx(0.6 * frames[2] + 0.4 * frames[1], abs=0.51)
-    assert recursive[2] == pytest.approx(0.6 * frames[2] + 0.4 * recursive[1], abs=0.51)
+    assert np.abs(mixed[2] - 0.6 * frames[2] - 0.4 * frames[1]).max() < 0.51
+    assert np.abs(recursive[2] - 0.6 * frames[2] - 0.4 * recursive[1]).max() < 0.51
     moved = prepare(replace(plain, warp=(0.02, 0.0)), 5)
     assert [np.abs(moved.frame(n).rgb - frames[n]).mean() > 2 for n in range(2)] == [True, True]
     assert np.array_equal(moved.frame(1).rgb, moved.frame(1).rgb)

@@ -25,6 +25,8 @@ _DARK_ROOM, _LIGHTED_ROOM = (-4.0, -2.5), (-2.0, -0.8)
 _ANGLES_DEG, _PLACE = (1.2, 4.0, 3.0), 0.35
 #: Narrower sensors see a panel of fewer pixels: drawing the picture would take longer than its reception.
 _NARROW_PX, _SMALL_PANEL_PX = 700, (342, 192)
+#: Share of films whose segments follow the picture; those of others are lit evenly.
+_SEGMENTS_DIMMED = 0.7
 #: Share of pictures that a camera held upside down takes, and of screens whose columns light by the picture.
 _UPSIDE_DOWN, _DIMMED = 0.15, 0.3
 
@@ -117,7 +119,8 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
             # LibRaw crops the models that it knows.
             scene = replace(scene, output="raw", make="Synthetic", model=scene.camera_name)
         if self.films:
-            scene = replace(scene, film=draw_film(self.films[rng.integers(len(self.films))], rng))
+            film, is_dimmed = draw_film(self.films[rng.integers(len(self.films))], rng), rng.random() < _SEGMENTS_DIMMED
+            scene = replace(scene, film=film, dimming="max" if is_dimmed else "none")
         if any(self.tilt_deg):
             tilt = np.array(self.tilt_deg) * rng.uniform(*self.tilt_share, 3) * rng.choice([-1, 1], 3)
             upright = np.array([scene.pose.roll_deg, scene.pose.yaw_deg, scene.pose.pitch_deg])
