@@ -604,6 +604,8 @@ class FrameResult:
     #: In the last result of a source: incomplete files, and sentences about refused ones.
     progress: tuple[ObjectProgress, ...] = ()
     link_notes: tuple[str, ...] = ()
+    #: In the last result of a clip: its incomplete files as the link layer keeps them; never part of a report.
+    files: tuple[Any, ...] = ()
     #: What there is to know of the result, the reason of a failure first.
     remarks: tuple[Remark, ...] = ()
     #: Whether the decoding process was killed; a resumed run then decodes the source again.

@@ -4,9 +4,10 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 
-from rxcli.link.files import FilesUnderWay
+from rxcli.link.files import FileState, FilesUnderWay
+from rxcli.link.formats import Announcement
 from rxcli.link.placement import Placement, placed
-from rxcli.link.receiver import LinkReceiver
+from rxcli.link.receiver import LinkReceiver, received
 from rxcli.link.softbits import Event
 from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.types import FILE_MEMORY_MB, FrameResult, FrameSoftBits, Message, ObjectProgress, ReceivedObject
@@ -31,6 +32,8 @@ class Collector:
         #: Placement of the source's columns; None until a message or file decides.
         self._placement: Placement | None = None
         self._source = ""
+        #: Incomplete files of clips before, by what is equal in all announcements of a file, and their size.
+        self._of_clips: dict[tuple[Announcement, tuple[int, ...]], FileState] = {}
         #: Profile of the screen that sends the source's text, None until there is one.
         self._screen: str | None = None
 
@@ -74,7 +77,8 @@ class Collector:
         """Add the remaining messages and files, complete or not, to the last result of the source."""
         events = [event for receiver in self._receivers.values() for event in receiver.finish()]
         notes = dict.fromkeys(sentence for receiver in self._receivers.values() for sentence in receiver.notes)
-        return replace(with_events(last, events), progress=tuple(self.progress), link_notes=tuple(notes))
+        last = replace(with_events(last, events), progress=tuple(self.progress), link_notes=tuple(notes))
+        return replace(last, files=tuple(file for receiver in self._receivers.values() for file in receiver.incomplete))
 
     @property
     def progress(self) -> list[ObjectProgress]:
@@ -83,9 +87,10 @@ class Collector:
 
 
 class PhotoCollector(Collector):
-    """Link layer of several photos of one transmission, which complete each other.
+    """Link layer of several photos of one transmission, which complete each other, or of several clips.
 
-    The first photo alone was tried before it comes here, so it is added only with the second one.
+    The first photo alone was tried before it comes here, so it is added only with the second one. Of clips, the
+    incomplete files are joined, as of one that a camera writes in chapters.
     """
 
     #: Number of photos that were incomplete on their own.
@@ -95,7 +100,9 @@ class PhotoCollector(Collector):
     _waiting: FrameResult | None = None
 
     def add(self, result: FrameResult) -> FrameResult:
-        """Add the messages and files that a photo completes; a result without soft bits is unchanged."""
+        """Add the messages and files that a photo or clip completes; other results are unchanged."""
+        if result.files:
+            return self._joined(result)
         if result.soft_bits is None:
             return result
         self.n_photos += 1
@@ -107,6 +114,23 @@ class PhotoCollector(Collector):
             joined, self._waiting = super().add(self._waiting), None
             result = with_events(result, (*joined.messages, *joined.objects))
         return super().add(result)
+
+    def _joined(self, result: FrameResult) -> FrameResult:
+        """Add the incomplete files of a clip to those of clips before."""
+        complete = []
+        for file in result.files:
+            key = replace(file.announcement, burst=0), file.total.shape
+            known = self._of_clips.get(key)
+            if known is None or not known.under_way:
+                if self._under_way.admit(file):
+                    self._of_clips[key] = file
+                continue
+            known.join(file)
+            if (found := known.unpacked()) is not None:
+                complete.append(received(known, found, result))
+        done = {file.object_id for file in complete}
+        progress = tuple(state for state in result.progress if state.object_id not in done)
+        return replace(with_events(result, complete), progress=progress, files=())
 
 
 def with_events(result: FrameResult, events: Sequence[Event]) -> FrameResult:

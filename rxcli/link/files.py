@@ -120,6 +120,15 @@ class FileState:
         gained, lost = (softbits.INFORMATION_OF_STEPS[steps.view(np.uint8)] for steps in (after, before))
         self.known += np.bincount(place // self.layout.n_bits, gained - lost, self.layout.n_blocks)
 
+    def join(self, continued: FileState) -> None:
+        """Add what another clip of the transmission gave, and decode what is ready."""
+        self.total = np.clip(self.total.astype(np.int16) + continued.total, -127, 127).astype(np.int8)
+        self.known = softbits.INFORMATION_OF_STEPS[self.total.view(np.uint8)].sum(axis=1).astype(np.float64)
+        self.blocks |= continued.blocks
+        self.threshold[:], self.min_information = self.layout.ready, 0.0
+        self.threshold[list(self.blocks)] = np.inf
+        self.read_ready(at_last=True)
+
     def read_ready(self, at_last: bool) -> None:
         """Decode blocks with enough information, several at once unless that takes long."""
         more = _RETRY_GAIN * self.layout.code.k

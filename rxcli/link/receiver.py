@@ -12,7 +12,7 @@ from rxcli.link.formats import Container
 from rxcli.link.layout import LABEL_BITS
 from rxcli.link.placement import Found, Placement
 from rxcli.link.softbits import MAX_LLR, Event
-from rxcli.types import FrameSoftBits, Message, ObjectProgress, ReceivedObject
+from rxcli.types import FrameResult, FrameSoftBits, Message, ObjectProgress, ReceivedObject
 
 
 class LinkReceiver:
@@ -51,7 +51,7 @@ class LinkReceiver:
         events: list[Event] = []
         found: list[Found] = []
         if not soft.open_start:
-            events += [self._object(soft, *complete) for complete in self._files.add(soft, self.placement)]
+            events += [received(*complete, soft) for complete in self._files.add(soft, self.placement)]
             announced = self._files.placement(soft.epoch)
             if announced is not None:
                 self.placement = announced
@@ -64,7 +64,7 @@ class LinkReceiver:
 
     def finish(self) -> list[Event]:
         """Decode the rest at the end of the transmission."""
-        return [self._object(self._last, *found) for found in self._files.finish() if self._last is not None]
+        return [received(*found, self._last) for found in self._files.finish() if self._last is not None]
 
     def _new_messages(self, soft: FrameSoftBits, found: Sequence[Found]) -> list[Event]:
         known = {(message.kind, message.data) for message in self.messages}
@@ -76,21 +76,26 @@ class LinkReceiver:
         self.messages += new
         return list(new)
 
-    @staticmethod
-    def _object(soft: FrameSoftBits, file: FileState, found: Container) -> ReceivedObject:
-        layout, data = file.layout, found.data
-        place = (soft.source, soft.frame, soft.time_s)
-        return ReceivedObject(found.name, data, len(data), found.sha256, layout.object_id, layout.n_blocks, *place)
+    @property
+    def incomplete(self) -> list[FileState]:
+        """Incomplete files."""
+        return [file for file in self._files.files.values() if file.under_way]
 
     @property
     def progress(self) -> list[ObjectProgress]:
         """Progress of incomplete files."""
-        return [file.progress() for file in self._files.files.values() if file.under_way]
+        return [file.progress() for file in self.incomplete]
 
     @property
     def notes(self) -> list[str]:
         """Sentences about refused messages and files."""
         return [*self._files.notes, *self._under_way.notes]
+
+
+def received(file: FileState, found: Container, where: FrameSoftBits | FrameResult) -> ReceivedObject:
+    """A complete file, with the frame that completed it."""
+    layout, data, place = file.layout, found.data, (where.source, where.frame, where.time_s)
+    return ReceivedObject(found.name, data, len(data), found.sha256, layout.object_id, layout.n_blocks, *place)
 
 
 def _cleaned(soft: FrameSoftBits) -> FrameSoftBits:

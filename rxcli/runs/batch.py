@@ -191,7 +191,7 @@ class Decoder:
     def linked(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
         """Results with the messages and files that are complete with them.
 
-        A photograph without any keeps its soft bits, for others may show the same.
+        A photograph without any keeps its soft bits, and a clip its incomplete files, for others may show the same.
         """
         if not self.link_screens:
             yield from map(explained, results)
@@ -202,7 +202,9 @@ class Decoder:
             if last:
                 taken = collector.finish(taken)
                 alone = number == 0 and not (taken.messages or taken.objects)
-                taken = replace(taken, soft_bits=result.soft_bits if alone else None)
+                taken = replace(
+                    taken, soft_bits=result.soft_bits if alone else None, files=() if alone else taken.files
+                )
             yield explained(taken)
 
     def _frames(self, source: Source, problems: list[tuple[str, bool]]) -> Iterator[Frame]:

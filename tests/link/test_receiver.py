@@ -1,5 +1,6 @@
 """Soft bits to messages and files: over whole transfers, from anywhere, and from what is no transfer at all."""
 
+import pickle
 import struct
 import tracemalloc
 from collections.abc import Iterable, Iterator
@@ -11,13 +12,15 @@ import pytest
 from rxcli.errors import UsageError
 from rxcli.lab.benchmark.goodput import detect
 from rxcli.link import ldpc
+from rxcli.link.collector import Collector, PhotoCollector
 from rxcli.link.encoder import FileSending, MessageSending, file_object, message, packet_slots_of
 from rxcli.link.files import FilesUnderWay
 from rxcli.link.formats import protect
 from rxcli.link.layout import announcement_layout
 from rxcli.link.receiver import LinkReceiver
+from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import encode_packet, indices_to_bits
-from rxcli.types import FrameSoftBits, Message, ReceivedObject
+from rxcli.types import FrameResult, FrameSoftBits, Message, ReceivedObject
 
 COLUMNS, SYMBOLS = 20, 24
 BRIGHT = (16.0,) * COLUMNS
@@ -134,6 +137,26 @@ def test_clips_of_an_object_whose_start_is_not_shared_add_up() -> None:
     events = receive(clip(sending, 20, 14, rng, epoch=1), receiver)
     events += receive(clip(sending, 5000, 25, rng, epoch=2), receiver)
     assert contents(events) == [data]
+
+
+@pytest.mark.parametrize("n_clips", [2, 3])
+def test_clips_that_show_parts_of_a_file_complete_it_together(n_clips: int) -> None:
+    """As the chapters that a camera writes; they come as processes send them."""
+    rng, screen = np.random.default_rng(8), load_profile("data-17k3", ScreenProfile)
+    columns, symbols = screen.columns, screen.payload_symbols
+    data = rng.bytes(14_000)
+    frames = list(clip(file_object("a.bin", data), 5, 60, rng, (16.0,) * columns, symbols))
+    together, came = PhotoCollector([screen]), []
+    for number in range(n_clips):
+        alone, [*others, last] = Collector([screen]), frames[number * 60 // n_clips : (number + 1) * 60 // n_clips]
+        for soft in others:
+            alone.add(FrameResult(f"{number}.mp4", soft.frame, soft.time_s, "ok", soft_bits=soft))
+        result = alone.finish(alone.add(FrameResult(f"{number}.mp4", last.frame, 0.0, "ok", soft_bits=last)))
+        assert (result.objects, len(result.progress)) == ((), 1)
+        came.append(together.add(pickle.loads(pickle.dumps(result))))
+    assert [[file.data for file in result.objects] for result in came] == [[]] * (n_clips - 1) + [[data]]
+    assert [len(result.progress) for result in came] == [1] * (n_clips - 1) + [0]
+    assert came[-1].objects[0].source == f"{n_clips - 1}.mp4"
 
 
 def test_progress_says_what_is_missing() -> None:
