@@ -124,6 +124,11 @@
     $("together-files").replaceChildren(...underWay(files, "Send more photos."));
   }
 
+  // What is being done, and for how long.
+  let doing = "", since = 0;
+  function tell(text) { doing = text; since = Date.now(); $("progress").textContent = text; }
+  setInterval(() => { if (doing) $("progress").textContent = `${doing} ${Math.floor((Date.now() - since) / 1000)} s`; }, 5000);
+
   async function work() {
     busy = true;
     if (!queue.some((entry) => entry.answer && selected)) $("result").hidden = true;
@@ -131,10 +136,10 @@
       entry.state.textContent = "reading …";
       entry.state.classList.add("busy");
       const left = queue.filter((one) => !one.answer).length - 1;
-      $("progress").textContent = `Reading ${entry.file.name}${left ? `, ${count(left, "file")} waiting` : ""} …`;
+      tell(`Searching ${entry.file.name} for a screen${left ? `, ${count(left, "file")} waiting` : ""} …`);
       answered(entry, await read(entry));
     }
-    $("progress").textContent = "";
+    tell("");
     busy = false;
   }
 
@@ -158,8 +163,8 @@
       if (!type.includes("json")) return failed(...(REFUSED[response.status] || [`The server answered with status ${response.status}.`, "Inform the operator of this page."]));
       if (!type.startsWith("application/x-ndjson")) return await response.json();
       return await lines(response, (answer) => {
-        if (answer.status === "waiting") $("progress").textContent = `Waiting: ${count(answer.place, "picture")} before yours …`;
-        else { answered(entry, answer); $("progress").textContent = "Reading the rest of the clip …"; }
+        if (answer.status === "waiting") tell(`Waiting: ${count(answer.place, "picture")} before yours …`);
+        else { answered(entry, answer); tell(`Reading the clip, ${count(answer.n_frames, "frame")} so far …`); }
       });
     } catch {
       return failed("The picture did not arrive.", "Check that this phone is still in the same network, and try again.");
@@ -167,7 +172,7 @@
   }
 
   // A line of JSON for what is known of a clip so far, now and then, and one for the whole answer, which is returned.
-  async function lines(response, tell) {
+  async function lines(response, partly) {
     const reader = response.body.getReader();
     const decoder = new TextDecoder();
     let text = "", answer = null;
@@ -178,7 +183,7 @@
       text = whole.pop();
       if (whole.length) {
         answer = JSON.parse(whole.pop());
-        if (answer.partial) tell(answer);
+        if (answer.partial) partly(answer);
       }
       if (done) break;
     }

@@ -233,6 +233,7 @@ class _Run:
         log.info("%s to decode, %d done before", report.plural(len(sources), "source"), n_done)
         with Progress(len(self._sources), n_done, quiet) as progress:
             for source, results in self._decoded(sources):
+                progress.begin(source.name)
                 with self._summarised(source.name) as (counted, scorer):
                     self._output.begin(source.name, scorer is not None)
                     for received, last in batch.with_last(results):

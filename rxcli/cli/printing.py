@@ -6,7 +6,8 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
+from threading import Event, Lock, Thread
 from typing import Any, Self, TextIO, TypeVar
 
 import click
@@ -132,6 +133,8 @@ def with_progress(items: Sequence[_T], what: str, unit: str) -> Iterator[_T]:
 class Progress:
     """How far a run is, on stderr: a bar on a terminal, elsewhere a line every ten seconds; a context manager.
 
+    A thread shows it while a picture is searched. The bar counts sources, or the frames of a single one.
+
     Args:
         n_total: sources of the run.
         n_done: sources completed by an earlier run.
@@ -144,19 +147,39 @@ class Progress:
         self._start_s = self._said_s = time.monotonic()
         self._prints = not quiet and not is_terminal(sys.stderr)
         self._hidden = quiet or self._prints
+        #: What is being received, and the frames of it so far.
+        self._source, self._n_frames = "", 0
+        self._lock, self._ended = Lock(), Event()
+        self._watch = Thread(target=self._keep_showing, daemon=True)
         #: Made when it has something to show: one photo is decoded before its package is loaded.
         self.bar: Any = None
 
     def __enter__(self) -> Self:
+        if self._prints or not self._hidden:
+            self._watch.start()
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        if self._watch.is_alive():
+            self._watch.join()
         if self.bar is not None:
             self.bar.close()
 
-    def hidden(self) -> AbstractContextManager[None]:
-        """A context in which others may write to the terminal; no lock is taken where there is no bar."""
-        return nullcontext() if self.bar is None else self.bar.external_write_mode()
+    def _keep_showing(self) -> None:
+        with suppress(OSError, ValueError):  # stderr was closed
+            while not self._ended.wait(_DELAY_S):
+                self._show_in_time()
+
+    @contextmanager
+    def hidden(self) -> Iterator[None]:
+        """While others may write to the terminal."""
+        with self._lock, nullcontext() if self.bar is None else self.bar.external_write_mode():
+            yield
+
+    def begin(self, source: str) -> None:
+        """A source is received."""
+        self._source, self._n_frames = report.printable_name(source), 0
 
     def add(self, result: FrameResult, last: bool) -> None:
         """Count a result, the last of its source or not."""
@@ -164,26 +187,36 @@ class Progress:
         received = sum(packet.is_believable for packet in result.packets)
         self._counts = [sum(pair) for pair in zip(self._counts, (1, received, came), strict=True)]
         self._done += last
-        now_s = time.monotonic()
-        if self._prints and now_s - self._said_s >= _EVERY_S:
-            self._said_s = now_s
-            click.echo(f"vlc-rx: {self.line(now_s - self._start_s)}", err=True)
-        if not self._hidden and self._done < self._total and now_s - self._start_s > _DELAY_S:
-            self._show()
+        self._n_frames += 1
+        self._show_in_time()
+
+    def _show_in_time(self) -> None:
+        """Print the line or draw the bar, if it is time."""
+        with self._lock:
+            now_s = time.monotonic()
+            if self._prints and now_s - self._said_s >= _EVERY_S:
+                self._said_s = now_s
+                click.echo(f"vlc-rx: {self.line(now_s - self._start_s)}", err=True)
+            if not self._hidden and self._done < self._total and now_s - self._start_s > _DELAY_S:
+                self._show()
 
     def _show(self) -> None:
-        """Draw the bar, if it is time."""
+        """Draw the bar."""
         from tqdm import tqdm
 
+        is_one = self._total == 1
+        n, form = self._n_frames if is_one else self._done, {"file": sys.stderr, "leave": False, "initial": self._done}
         if self.bar is None:
-            form: dict[str, Any] = {"unit": "source", "file": sys.stderr, "leave": False}
-            self.bar = tqdm(total=self._total, initial=self._done, **form)
+            self.bar = tqdm(**form, **({"unit": " frames"} if is_one else {"unit": "source", "total": self._total}))
         self.bar.set_postfix_str(self._so_far(), refresh=False)
-        self.bar.update(self._done - self.bar.n)
+        self.bar.update(n - self.bar.n)
+        self.bar.refresh()
 
     def _so_far(self) -> str:
         frames, packets, came = self._counts
-        return f"{report.plural(frames, 'frame')}, {report.plural(packets, 'packet')}, {came} texts and files"
+        counts = f"{report.plural(frames, 'frame')}, {report.plural(packets, 'packet')}, {came} texts and files"
+        doing = f"frame {self._n_frames}" if self._n_frames else "searching"
+        return f"{counts}; {self._source}: {doing}" if self._source else counts
 
     def line(self, passed_s: float) -> str:
         """How far it is after some seconds, and when it will end."""

@@ -127,7 +127,8 @@ class DecodingProcess:
         while True:
             while not self._connection.poll(_POLL_S):
                 if time.monotonic() > end_s:
-                    raise _EndedError(f"it took more than {self._limits.time_s:.0f} s", "try a smaller picture")
+                    reason = f"nothing was found in {self._limits.time_s:.0f} s, after which the page gives up"
+                    raise _EndedError(reason, "photograph the screen from nearer, or decode the file by `vlc-rx`")
                 if resident_bytes(self.pid) > self._limits.resident_bytes:
                     raise _EndedError("it takes too much memory", "try a smaller picture")
             answer, n_bytes = receive(self._connection)

@@ -65,6 +65,35 @@ def test_progress_tells_the_end(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
         assert line.startswith("vlc-rx: 3 of 12 photos and clips; 2 frames, 4 packets")
 
 
+def until(words: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """What a thread writes, up to some words."""
+    said = ""
+    for _ in range(100_000):
+        said += capsys.readouterr().err
+        if words in said:
+            return said
+    raise AssertionError(said)
+
+
+@pytest.mark.parametrize(
+    ("on_terminal", "n_total", "words"), [(True, 1, " frames"), (True, 2, "0/2"), (False, 1, "0 of 1")]
+)
+def test_a_photo_that_is_searched_and_a_clip_show_how_far_they_are(
+    on_terminal: bool, n_total: int, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before the first result, too: a thread shows it."""
+    monkeypatch.setattr(printing, "is_terminal", lambda stream: on_terminal)
+    monkeypatch.setattr(printing, "_DELAY_S", 0.0)
+    monkeypatch.setattr(printing, "_EVERY_S", 0.0)
+    with Progress(n_total, 0, quiet=False) as progress:
+        progress.begin("photo.jpg")
+        said = until("photo.jpg: searching", capsys)
+        assert words in said
+        progress.add(frame(0, 30), last=False)
+        assert until("photo.jpg: frame 1", capsys)
+    assert not progress._watch.is_alive()
+
+
 def test_a_terminal_gets_a_bar_when_there_is_time_to_read_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
