@@ -411,15 +411,17 @@ class PacketResult:
         return bytes.fromhex(self.payload)
 
 
-_OfPicture = Literal["black", "saturated", "few_pixels", "too_tall", "no_columns", "no_columns_dark", "lit"]
-_OfOutline = Literal["portrait", "on_its_side", "corners_far", "corners_outside", "corners_few_rows"]
+_OfPicture = Literal["black", "saturated", "few_pixels", "too_tall", "no_columns", "lit", "no_columns_dark"]
+_OfOutline = Literal["no_columns_striped", "corners_far", "corners_outside", "corners_few_rows"]
 _OfStripes = Literal["no_stripes", "part_striped", "narrow_stripes", "no_stripes_across", "long_exposure"]
 _OfLight = Literal["steady_light", "one_lamp", "screen_dark", "nothing_lit", "unsure", "no_column"]
 _OfPackets = Literal["no_headers", "no_header", "part_in_view", "screen_fills_little", "packet_too_long"]
 _OfColumn = Literal["headerless", "echo", "out_of_view", "goes_on", "withheld", "incomplete", "dark", "uncertain"]
 _OfNumbers = Literal["not_read", "column_numbers", "one_column", "column_alone", "all_the_same", "one_screen_tried"]
 _OfCamera = Literal["no_readout_mode", "other_camera", "other_exposure", "other_camera_and_exposure", "not_believed"]
-_OfRows = Literal["upside_down", "as_stored", "turned_clockwise", "turned_counterclockwise"]
+_OfRows = Literal[
+    "portrait", "on_its_side", "stripes_down", "upside_down", "as_stored", "turned_clockwise", "turned_counterclockwise"
+]
 _OfClip = Literal["stabilised", "doubled", "certain_before", "nominal_times", "retimed", "slow_motion"]
 #: Why a result is as it is; `rxcli.results.reasons` has a sentence for each.
 Reason = Literal[

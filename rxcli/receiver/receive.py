@@ -106,7 +106,7 @@ def _receive_still(cache: FrameCache, options: ReceiverOptions, least: float) ->
     received = [_receive_screen(nothing, cache, outlines, options, least) for outlines in screens]
     clearest = received[0].result
     if not screens[0][0].stands_out and not clearest.packets and clearest.reason != "steady_light":
-        return Received(failed(nothing, no_screen(cache, options)), {})
+        return Received(failed(nothing, no_screen(cache)), {})
     best, *less = sorted(received, key=lambda screen: -screen.n_believable)
     other_screens = tuple(screen.result for screen in less if screen.result.packets)
     return best._replace(result=replace(best.result, other_screens=other_screens))

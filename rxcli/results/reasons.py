@@ -23,6 +23,8 @@ def sentence_of(remark: Remark) -> str:
     }
     for name, scale, unit in (("_s", 1e6, "_us"), ("_hz", 1e-3, "_khz")):
         facts |= {key.removesuffix(name) + unit: scale * facts[key] for key in [*facts] if key.endswith(name)}
+    exposure_s = facts.get("exposure_s") or 1.0
+    facts["exposure"] = f"1/{1 / exposure_s:.0f} s" if exposure_s < 0.5 else f"{exposure_s:.2g} s"
     if "share" in facts:
         # Of a packet that a picture shows: further pictures show the rest of a text.
         facts |= {"share_percent": 100 * facts["share"], "n_photos": max(ceil(1 / max(facts["share"], 0.05)), 2)}

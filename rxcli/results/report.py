@@ -104,7 +104,8 @@ _FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 def format_frame(result: FrameResult) -> str:
     """A heading and one row per packet; columns without packets are grouped if their rows are equal."""
     reason = printable((result.message or "").removeprefix(result.source + ": "))
-    lines = [format_heading(result), *(f"  {text}" for text in (mirror_note(result, "--mirrored"), reason) if text)]
+    texts = (mirror_note(result, "--mirrored"), *reason.split("; ", 1))
+    lines = [format_heading(result), *(f"  {text}" for text in texts if text)]
     clip = _is_clip(result)
     scored = any(packet.bit_errors is not None for packet in result.packets)
     rows = table_rows(result, clip, scored)

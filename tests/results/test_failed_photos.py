@@ -19,12 +19,15 @@ from rxcli.web.decoding import answer_for
 
 #: Kind of photo -> a part of the reason, and of the next step.
 PHOTOS = {
-    "too dark": ("it is dark (5 % of white on average)", "expose longer, raise ISO, or show a brighter picture"),
-    "portrait": (
-        "its columns lie along the rows, as in portrait or where a picture was turned after it was taken",
-        "use the camera's own file, taken in landscape",
+    "too dark": (
+        "the picture is dark (5 % of white on average), and no screen that sends was found",
+        "raise ISO, or show a brighter picture",
     ),
-    "ordinary": ("no columns of a modulated backlight were found in the picture", "photograph a screen that sends"),
+    "portrait": (
+        "the same stripes run across all columns, as of a screen on its side in the picture (portrait)",
+        "turn the camera, until its long side lies along the screen's",
+    ),
+    "ordinary": ("no screen that sends was found", "photograph it from near"),
 }
 
 
@@ -49,7 +52,7 @@ def test_a_failed_photo_says_why_wherever_it_is_read(
     path = tmp_path / "photo.jpg"
     path.write_bytes(photo(kind))
     assert run(["decode", str(path)]) == 1
-    assert capsys.readouterr().out.count(f"{reason}; {step}") == 1
+    assert capsys.readouterr().out.count(f"  {reason}\n  {step}") == 1
 
     answer = answer_for(path, "the picture", receiver_options(soft_bits=True))
     assert answer["headline"] == "No screen found"

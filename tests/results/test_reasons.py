@@ -2,6 +2,7 @@
 
 import ast
 import string
+from functools import cache
 from pathlib import Path
 from typing import get_args
 
@@ -15,6 +16,7 @@ from rxcli.types import ColumnResult, FrameResult, Reason, Remark
 CODE = [path.read_text(encoding="utf-8") for path in Path(rxcli.__file__).parent.rglob("*.py")]
 
 
+@cache
 def constants() -> set[str]:
     """Texts in the code, docstrings aside."""
     nodes = (node for text in CODE for node in ast.walk(ast.parse(text)))

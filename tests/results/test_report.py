@@ -138,7 +138,7 @@ def test_the_table_shows_what_a_person_looks_for() -> None:
     assert second.split()[4:] == ["0.9999", "2.76", "ab" * 10]  # never rounded up to certainty; a short one whole
     assert first.index("d076") == header.index("payload")
     assert dark.split(maxsplit=2) == ["1-2", "dark", "too little light; expose longer"]
-    assert format_frame(BAD) == "c.jpg | unreadable\n  the file is empty; copy it again"
+    assert format_frame(BAD) == "c.jpg | unreadable\n  the file is empty\n  copy it again"
 
 
 def summary(*results: FrameResult, score: Score | None = None) -> SourceSummary:

@@ -12,7 +12,7 @@ from rxcli.receiver.frame.result import Failure, Received, failed, is_received
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
 from rxcli.receiver.plane import orientation
 from rxcli.receiver.search.cameras import known_camera
-from rxcli.receiver.search.outlines import lean_on_its_side, unreadable_orientation
+from rxcli.receiver.search.outlines import may_be_turned
 from rxcli.receiver.search.refusal import likeliest_reason
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.types import Frame, FrameResult, Reason, Remark
@@ -35,11 +35,8 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
         return received.with_remark(Remark(reason) if reason == "upside_down" or asks_for_turn else None)
     if options.corners is not None or received.result.reason == "steady_light":
         return received
-    lean = lean_on_its_side(upright, options)
-    if not lean:
-        return received.with_remarks(*likeliest_reason(frame, received.result, options))
     attempts = []
-    for quarter_turns in orientation.QUARTER_TURNS if lean < 0 else ():
+    for quarter_turns in orientation.QUARTER_TURNS if may_be_turned(upright, options) else ():
         back = orientation.turned_frame(frame, quarter_turns)
         attempt = receive(FrameCache(back, cache.timer).in_blinking_colours(), options, -inf)
         result = orientation.as_stored(back, attempt.result, quarter_turns)
@@ -49,8 +46,12 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
     if attempts:
         (*_, quarter_turns), best = max(attempts, key=lambda attempt: attempt[0])
         return best.with_remark(Remark("turned_counterclockwise" if quarter_turns == 1 else "turned_clockwise"))
-    failure = unreadable_orientation(frame) or Failure(Remark("on_its_side"), "no_screen")
-    return Received(failed(FrameResult(frame.source, frame.index, frame.time_s, "ok"), failure), {})
+    remarks = likeliest_reason(frame, received.result, options)
+    if remarks and remarks[0].reason in ("portrait", "on_its_side"):
+        # Packets that are not believable are none then.
+        nothing = FrameResult(frame.source, frame.index, frame.time_s, "ok")
+        return Received(failed(nothing, Failure(remarks[0], "no_screen")), {})
+    return received.with_remarks(*remarks)
 
 
 def _receive_stated(cache: FrameCache, options: ReceiverOptions, receive: _Receive) -> Received:

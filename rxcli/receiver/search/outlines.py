@@ -6,6 +6,7 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
+from rxcli.receiver.decode.steady import periodic_share
 from rxcli.receiver.frame.cache import FrameCache, key_of
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
@@ -14,7 +15,7 @@ from rxcli.receiver.plane.orientation import PORTRAIT
 from rxcli.receiver.screen import find, geometry
 from rxcli.receiver.screen.bright import bright_quadrilateral, faint_quadrilaterals, striped_box
 from rxcli.receiver.screen.outline import Outline
-from rxcli.receiver.screen.stripes import MIN_LEAN, stripe_lean
+from rxcli.receiver.screen.stripes import MIN_LEAN, common_stripes, stripe_lean
 from rxcli.receiver.search.cameras import known_lens
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.types import FloatArray, Frame, Remark
@@ -40,7 +41,7 @@ def proposed_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
     if found or without:
         return found or [without]
     if "no_screen" in options.skip or not may_fill(frame):
-        return no_screen(cache, options)
+        return no_screen(cache)
     return [[Outline(whole_picture(frame), inferred=geometry.SIDE_NAMES, column_offset=None)]]
 
 
@@ -70,10 +71,9 @@ def _viewed(outline: Outline, frame: Frame) -> Outline:
     return replace(outline, corners=geometry.viewer_order(outline.corners, frame.metadata.orientation))
 
 
-def no_screen(cache: FrameCache, options: ReceiverOptions) -> Failure:
+def no_screen(cache: FrameCache) -> Failure:
     """Failure of a picture without a screen."""
-    reason = Remark("on_its_side") if lean_on_its_side(cache, options) else reason_for_none(cache)
-    return Failure(reason, "no_screen")
+    return Failure(reason_for_none(cache), "no_screen")
 
 
 def _given(corners: FloatArray, cache: FrameCache, options: ReceiverOptions) -> Outline:
@@ -163,29 +163,25 @@ def whole_picture(frame: Frame) -> FloatArray:
     return geometry.viewer_order(corners, frame.metadata.orientation)
 
 
-def lean_on_its_side(cache: FrameCache, options: ReceiverOptions) -> float:
-    """Lean of the stripes (see `stripe_lean`) of a screen whose columns lie along the picture's rows; 0 of others.
-
-    Negative: the picture was turned after it was taken; positive: it was taken in portrait. Of a clip only the first
-    frame is examined.
-    """
+def may_be_turned(cache: FrameCache, options: ReceiverOptions) -> bool:
+    """Whether a photograph may have been turned after it was taken: its stripes run downwards, as its rows do."""
+    frame = cache.frame
+    if not may_fill(frame) or frame.mosaic is not None or stripe_lean(frame.pixels) > -MIN_LEAN:
+        return False
     layouts = [layout for layout in layouts_of(options) if not layout.is_narrow]
     shown = (screen[0] for screen in possible_screens(cache, options))
     upright = max((outline.contrast for outline in shown if outline.stands_out), default=0.0)
-    return cache.once(("lean", *layouts), lambda: _lean(cache, layouts, upright))
-
-
-def _lean(cache: FrameCache, layouts: list[find.ColumnLayout], upright: float) -> float:
-    """`lean_on_its_side` of a picture whose upright columns stand out by a contrast of `upright`; 0 if they do not."""
-    frame = cache.frame
-    if frame.index or not may_fill(frame) or frame.mosaic is not None:
-        return 0.0
-    lean = stripe_lean(frame.pixels)
-    # Upright columns have stripes across them.
-    if abs(lean) < MIN_LEAN or lean > 0 < upright:
-        return 0.0
     lying = next(iter(find.find_screens(turned(cache.plane), layouts)), [])
-    return lean if lying and lying[0].stands_out and lying[0].contrast >= upright else 0.0
+    return bool(lying) and lying[0].stands_out and lying[0].contrast >= upright
+
+
+def common_light(frame: Frame) -> Remark | None:
+    """What shows the same stripes in all columns: a screen on its side, or light without data; None of others."""
+    likeness, stripes = common_stripes(frame.pixels)
+    if likeness < SETTINGS.min_common_light:
+        return None
+    is_even = periodic_share(stripes[None], stripes.size // SETTINGS.min_even_stripes) > SETTINGS.even_share
+    return Remark("steady_light" if is_even else "on_its_side")
 
 
 def reason_for_none(cache: FrameCache) -> Remark:
@@ -194,10 +190,17 @@ def reason_for_none(cache: FrameCache) -> Remark:
     levels = frame.mosaic
     black, white = (frame.black, frame.white) if levels is None else (float(np.mean(levels.black)), levels.white)
     useless = find.why_useless(frame.pixels, black, white)
+    if useless is not None:
+        return useless
+    is_striped = levels is None and stripe_lean(frame.pixels) > MIN_LEAN
+    common = common_light(frame) if is_striped else None
     mean = float(find.thinned(frame.pixels, black, white).mean())
-    if useless is None and mean < SETTINGS.dark_mean:
+    # Rows have noise in common in the dark.
+    if mean < SETTINGS.dark_mean and (common is None or common.reason == "on_its_side"):
         return Remark("no_columns_dark", {"mean_percent": 100 * max(mean, 0.0)})
-    return useless or Remark("no_columns" if _bright(cache) is None else "lit")
+    if is_striped:
+        return common or Remark("no_columns_striped")
+    return Remark("no_columns" if _bright(cache) is None else "lit")
 
 
 def too_small(context: FrameContext, screen: ScreenProfile) -> Remark | None:

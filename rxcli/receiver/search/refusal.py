@@ -14,36 +14,48 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception, dark_columns, shows_steady_light
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.frame.settings import SETTINGS as PASSES
-from rxcli.receiver.screen.stripes import MIN_LEAN, stripe_lean
+from rxcli.receiver.plane.orientation import PORTRAIT
+from rxcli.receiver.screen.stripes import MIN_LEAN, common_stripes, stripe_lean
 from rxcli.receiver.search.hypothesis import Hypothesis
-from rxcli.receiver.search.outlines import too_small
+from rxcli.receiver.search.outlines import common_light, too_small
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import as_one_column
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import BELIEVABLE, Frame, FrameResult, Remark, RowProfiles
 
+#: Reasons that nothing makes likelier.
+_PLAIN = ("steady_light", "one_lamp", "black", "saturated", "few_pixels", "too_tall", "portrait")
+
 
 def likeliest_reason(frame: Frame, result: FrameResult, options: ReceiverOptions) -> tuple[Remark, ...]:
-    """Remarks on a refusal that begin with what is likeliest: a long exposure, or no screen that sends.
+    """Remarks on a refusal that begin with what is likeliest: a long exposure, a camera on its side, or no such screen.
 
     Args:
         frame: the picture.
         result: without a believable packet.
         options: with the screens that were tried.
     """
-    remarks, exposure_s = result.remarks or (Remark("unsure"),), frame.metadata.exposure_s or 0.0
+    metadata, remarks = frame.metadata, result.remarks or (Remark("unsure"),)
     # A packet of an uncertain column is still a packet.
     is_sent = any(packet.confidence > BELIEVABLE * result.column_certainty for packet in result.packets)
-    if is_sent or result.reason in ("steady_light", "one_lamp") or frame.mosaic is not None:
+    if is_sent or result.reason in _PLAIN or frame.mosaic is not None:
         return result.remarks
+    exposure_s = metadata.exposure_s or 0.0
     slots = exposure_s * min(screen.slot_rate_hz for screen in options.screens)
-    is_none = result.status == "no_screen"
-    if slots > SETTINGS.max_named_slots and (not is_none or result.reason in ("no_columns", "lit")):
+    if slots > SETTINGS.max_named_slots:
         return (Remark("long_exposure", {"exposure_s": exposure_s, "slots": slots}),)
-    if is_none or stripe_lean(frame.pixels) > MIN_LEAN:
+    lean = stripe_lean(frame.pixels)
+    if lean > MIN_LEAN and metadata.orientation in PORTRAIT:
+        return (Remark("portrait", {"orientation": metadata.orientation}),)
+    if lean < -MIN_LEAN and common_stripes(frame.pixels.T)[0] > SETTINGS.min_common_light:
+        return (Remark("stripes_down"),)
+    if result.status == "no_screen":
         return remarks
-    return (Remark("no_stripes_across"), *remarks)
+    if lean < MIN_LEAN:
+        return (Remark("no_stripes_across"),)
+    common = common_light(frame)
+    return remarks if common is None else (common,)
 
 
 def light_without_data(context: FrameContext, reception: Reception) -> Failure | None:

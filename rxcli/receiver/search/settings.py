@@ -48,6 +48,13 @@ class SearchSettings(msgspec.Struct, frozen=True):
     max_named_slots: float = 3.0
     #: Mean, as a share of white, below which a picture without a screen is reported as dark.
     dark_mean: float = 0.08
+    #: Correlation from which columns far apart have the same stripes: of screens on their side 0.66 and more, of
+    #: upright ones at most 0.5.
+    min_common_light: float = 0.6
+    #: Share of their variance that one period explains, from which stripes are even: of lamps and text 0.6 and more, of
+    #: packets at most 0.3; and number of stripes from which they may be.
+    even_share: float = 0.45
+    min_even_stripes: int = 8
     #: Largest size of an outline relative to the picture, beyond which less than one column is visible.
     largest_outline: float = 50.0
 
