@@ -69,7 +69,7 @@ def test_the_same_in_all_columns_is_received_and_named(numbers: tuple[int, ...],
     sent = {np.packbits(payload(number)).tobytes().hex() for number in numbers}
     right = {column.column for column in result.columns for packet in column.packets if packet.payload in sent}
     assert len(right) >= 18
-    assert (result.message or "").endswith("all columns send the same")
+    assert result.remarks[-1].reason == "all_the_same"
 
 
 @pytest.mark.parametrize("n_frames", [1, 3])
