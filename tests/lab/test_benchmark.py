@@ -338,6 +338,13 @@ def test_lost_packets_and_goodput_have_intervals() -> None:
     assert "kbps" not in measures.rows([still], ["receiver"], ["kbps", "kbps95"])[-1]
 
 
+def test_shares_of_a_way_without_another_are_left_out() -> None:
+    (row, _) = measures.rows([_record("sky")], ["receiver"], ["right", "share", "share95"])
+    assert not row.keys() & {"share", "share95"}
+    (row, _) = measures.rows([_record("sky")], ["receiver"], ["right", "share", "share95"], "receiver")
+    assert row["share"] == 1
+
+
 def test_the_headline_puts_receiver_and_yardsticks_side_by_side() -> None:
     record = _record("sky")
     record["ways"]["paper"] = record["ways"]["bound"]

@@ -185,7 +185,9 @@ MEASURES: dict[str, Callable[[Group], Any]] = {
     "expected": lambda g: g.score.expected if g.scores else None,
     "right": lambda g: g.score.error_free if g.scores else None,
     "share": lambda g: g.score.error_free / max(g.yardstick.score.error_free, 1) if g.beside else None,
-    "share95": lambda g: wilson(g.score.error_free, max(g.yardstick.score.error_free, g.score.error_free)),
+    "share95": lambda g: (
+        wilson(g.score.error_free, max(g.yardstick.score.error_free, g.score.error_free)) if g.beside else None
+    ),
     "of_plain": lambda g: _of_plain(g) if g.plain else None,
     "ber": lambda g: g.score.ber,
     "ber95": _ber_interval,
