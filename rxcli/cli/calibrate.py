@@ -20,7 +20,7 @@ from rxcli.calibrate.slots import calibrate_slots
 from rxcli.cli.common import force_argument, json_output, options, output, refuse, write_json
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.cli.kinds import FILE
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import InputError, UsageError, printable
 from rxcli.ingest import KNOWN_SUFFIXES, open_source
 from rxcli.outputs import CAMERA, PICTURE, claim
 from rxcli.profiles import NAME, CameraProfile, LensModel, ReadoutMode, ScreenProfile, load_profile
@@ -104,7 +104,7 @@ class _Results:
             lines = [*lines, ("written", str(self._target))]
         write_json({**record, "profile": self._target and str(self._target)}, self._json_path)
         if self._json_path != "-":
-            click.echo("\n".join(f"{label:11} {text}" for label, text in lines))
+            click.echo("\n".join(f"{label:11} {printable(text)}" for label, text in lines))
 
 
 def _integers(option: str, text: str, separator: str, example: str) -> tuple[int, ...]:

@@ -129,9 +129,7 @@ def main() -> None:
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
     os.environ["PYTHONSAFEPATH"] = "1"  # no child takes modules from the current folder
     sys.path[:] = filter(None, sys.path)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _end)
-    code = run(sys.argv[1:])
+    code = run(sys.argv[1:], is_program=True)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run has ended, and its exit code stands
     gc.freeze()  # else the interpreter looks for garbage among all objects once more before it ends
     sys.exit(code)
@@ -163,11 +161,18 @@ class _ClosedStream(io.TextIOBase):
         raise OutputError("stdout is closed", "redirect it to a file, or use --quiet")
 
 
-def run(arguments: Sequence[str]) -> int:
-    """Run `vlc-rx` with `arguments`; errors become one line on stderr. Returns the exit code."""
+def run(arguments: Sequence[str], is_program: bool = False) -> int:
+    """Run `vlc-rx` with `arguments`; errors become one line on stderr. Returns the exit code.
+
+    Args:
+        arguments: of the command line.
+        is_program: whether signals end it with its summary.
+    """
     _log_to_stderr()
     color = False if os.environ.get("NO_COLOR") else None  # https://no-color.org
     try:
+        for number in (signal.SIGINT, signal.SIGTERM) if is_program else ():
+            signal.signal(number, _end)
         code = cli.main(args=list(arguments), prog_name="vlc-rx", standalone_mode=False, color=color)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.ctx.get_help())

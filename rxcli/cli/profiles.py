@@ -11,7 +11,7 @@ from rxcli.cli.common import force_argument, json_output, options, write_json
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.cli.kinds import CAMERA
 from rxcli.cli.printing import print_text
-from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, worst
+from rxcli.errors import ExitCode, InputError, ReceiverError, UsageError, printable, worst
 from rxcli.ingest import open_source
 from rxcli.outputs import claim
 from rxcli.profiles import CameraProfile, ScreenProfile, dump_profile, known_profiles, load_profile, match_camera
@@ -44,7 +44,7 @@ def list_profiles(json_path: str | None, force: bool) -> None:
         return
     for profile, origin, _ in known:
         described = f"; {profile.description}" if profile.description else ""
-        print_text(f"{profile.kind}  {profile.name:<16} {origin:<8} {_about(profile)}{described}")
+        print_text(printable(f"{profile.kind}  {profile.name:<16} {origin:<8} {_about(profile)}{described}"))
     click.echo(f"\nuser profiles lie in {user_dir()} (cameras/, screens/); `profiles show NAME` prints one")
 
 
@@ -86,7 +86,7 @@ def validate(names: tuple[str, ...]) -> int:
             log.error("%s", error)
             codes.append(error.exit_code)
         else:
-            click.echo(f"{name}: valid {profile.kind} profile {profile.name!r}")
+            click.echo(printable(f"{name}: valid {profile.kind} profile {profile.name!r}"))
     return worst(codes)
 
 
@@ -110,7 +110,7 @@ def which(paths: tuple[Path, ...], cameras: tuple[str, ...], json_path: str | No
     write_json(records, json_path)
     if json_path != "-":
         for record in records:
-            click.echo(f"{record['source']}: {record['camera'] or 'no profile'} ({record['reason']})")
+            click.echo(printable(f"{record['source']}: {record['camera'] or 'no profile'} ({record['reason']})"))
     return worst(codes)
 
 

@@ -179,13 +179,15 @@ class Journal:
         facts: object = None
         lines: list[bytes] = []
         results: list[FrameResult] = []
+        complete: set[str] = set()
         with replacing(self._path, follow=False) as hidden, hidden.open("wb") as out:
             for number, (line, record, result) in enumerate(_records(self._path)):
                 run = record.get("run", run)
                 if number == 0 and head is not None:
                     _check_same(self._path, head, run)
-                if results and result.source != results[0].source:
-                    lines, results = [], []
+                if result.source in complete or (results and result.source != results[0].source):
+                    reason = f"{self._path} line {number + 1}: results of {result.source} stand in two places"
+                    raise UsageError(reason, f"the file was edited; {_ANOTHER}, as it was")
                 if not results:
                     facts = record.get("file")
                 lines.append(line)
@@ -197,6 +199,7 @@ class Journal:
                         lines[0] = json.dumps({**json.loads(lines[0]), "run": run}).encode() + b"\n"
                     out.writelines(lines)
                     yield results[0].source, results
+                complete.add(result.source)
                 lines, results = [], []
         self._open()
 

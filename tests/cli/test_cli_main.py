@@ -10,6 +10,7 @@ from typing import Any
 import click
 import pytest
 from commands import COMMAND, ENVIRONMENT
+from small_frames import write_frame, write_profiles
 
 from rxcli import __version__
 from rxcli.cli import main as cli_main
@@ -35,6 +36,44 @@ def test_help_of_every_command_breaks_no_words_at_80_characters(
         assert not [line for line in lines if line.endswith("-") and line[-2:-1].isalpha()], arguments
         assert not any("\u2011" in line for line in lines)
         assert not any(line.endswith("...") and "Usage:" not in line for line in lines), arguments
+
+
+def test_help_is_there_where_python_keeps_no_docstrings() -> None:
+    for arguments in ([], ["decode"], ["calibrate", "lens"], ["profiles"]):
+        plain, stripped = (
+            subprocess.run([sys.executable, *flags, *COMMAND[1:], *arguments, "--help"], env=ENVIRONMENT, stdout=-1)
+            for flags in ([], ["-OO"])
+        )
+        assert stripped.stdout == plain.stdout != b"", arguments
+
+
+def test_ctrl_c_before_the_program_has_begun_is_no_traceback(tmp_path: Path) -> None:
+    """A library that it loads first stands for the moment."""
+    (tmp_path / "click.py").write_text(
+        "import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nimport time\ntime.sleep(9)\n"
+    )
+    environment = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join((str(tmp_path), ENVIRONMENT["PYTHONPATH"]))}
+    ended = subprocess.run([*COMMAND, "profiles"], env=environment, capture_output=True, cwd=tmp_path.parent)
+    assert (ended.returncode, ended.stderr) == (130, b"vlc-rx: interrupted\n")
+
+
+def test_profiles_show_no_control_characters_of_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    odd, home = tmp_path / "a\x1b[31m\u202e.png", tmp_path / "home" / "screens"
+    write_frame(odd, 1)
+    write_profiles(tmp_path)
+    home.mkdir(parents=True)
+    text = (tmp_path / "screen.toml").read_text()
+    (home / "odd.toml").write_text(f'{text}description = "a\\u001b[31m"\n')
+    (tmp_path / "s\x1b[31m.toml").write_text(text)
+    monkeypatch.setenv("VLC_RX_HOME", str(tmp_path / "home"))
+    commands = (["which", str(odd)], ["list"], ["show", "odd"], ["validate", str(tmp_path / "s\x1b[31m.toml")])
+    for command in commands:
+        assert run(["profiles", *command]) == 0
+        shown = capsys.readouterr()
+        assert "\x1b" not in shown.out + shown.err, command
+        assert "\u202e" not in shown.out + shown.err, command
 
 
 def loaded_by(*arguments: str) -> set[str]:

@@ -255,6 +255,25 @@ def test_recover_leaves_out_sources_whose_decoder_was_killed(tmp_path: Path, nam
     assert [path.name for path in tmp_path.iterdir()] == ["out.jsonl"]
 
 
+@pytest.mark.parametrize(("order", "line"), [([0, 1, 2, 0, 1], 4), ([0, 2, 1], 2), ([3, 0, 3], 5), ([2, 3, 3], 5)])
+def test_recover_refuses_a_file_in_which_a_source_stands_twice(tmp_path: Path, order: list[int], line: int) -> None:
+    """Or in turns with another one: its packets would count twice."""
+    path = tmp_path / "out.jsonl"
+    lines = write_journal(path, "aabccc").splitlines(True)
+    parts = [lines[0], lines[1], lines[2], b"".join(lines[3:])]
+    run = json.loads(lines[0])["run"]
+    edited = b"".join(parts[number] for number in order).splitlines(True)
+    edited[0] = json.dumps({**json.loads(edited[0]), "run": run}).encode() + b"\n"
+    path.write_bytes(b"".join(edited))
+    with (
+        closing(Journal(path, resume=True)) as journal,
+        pytest.raises(UsageError, match="stand in two places") as found,
+    ):
+        list(journal.recover())
+    assert f"line {line}: " in str(found.value)
+    assert path.read_bytes() == b"".join(edited)
+
+
 @pytest.mark.parametrize("text", ["hello\nworld\n", "hello", "{}\n", '[1, 2]\n{"source": 3}\n', "null\n"])
 def test_recover_leaves_a_foreign_file_alone(tmp_path: Path, text: str) -> None:
     path = tmp_path / "letter.txt"
