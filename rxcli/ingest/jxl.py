@@ -38,7 +38,7 @@ def read_jxl(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]:
     with damage_explained(f"{path}: the JPEG XL picture is damaged or cut", "copy the file again"):
         pixels = imagecodecs.jpegxl_decode(data, index=0, keeporientation=True)
     if pixels.dtype.kind == "f":
-        pixels = np.rint(np.clip(pixels, 0, 1) * 65535).astype(np.uint16)
+        pixels = np.rint(np.clip(pixels, 0, 1) * np.float32(65535)).astype(np.uint16)
     elif pixels.dtype == np.uint16:
         pixels <<= max(16 - bits, 0)
     return (

@@ -144,9 +144,10 @@ def test_avif_of_several_tiles(tmp_path: Path) -> None:
         (GREY.astype(np.uint16) * 4, {"bitspersample": 10}),
         (GREY.astype(np.uint16) * 257, {}),
         (GREY / np.float32(255), {}),
+        ((GREY / 255).astype(np.float16), {}),
         (np.tile(GREY, (30, 1)), {}),
     ],
-    ids=["grey", "boxes", "10 bits", "16 bits", "floats", "high"],
+    ids=["grey", "boxes", "10 bits", "16 bits", "floats", "short floats", "high"],
 )
 def test_jpeg_xl(tmp_path: Path, pixels: np.ndarray, options: dict[str, int]) -> None:
     data = imagecodecs.jpegxl_encode(pixels, lossless=True, **options)
