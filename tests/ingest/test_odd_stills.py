@@ -260,3 +260,16 @@ def test_collected_files_are_as_their_plain_twin(shared_cases: Path) -> None:
         if frame.linear:  # light of a gamma of 2.2, as shares of the brightest
             values = (values / values.max()) ** (1 / 2.2) * plain.max() / 255
         assert np.abs(255 * values - plain).mean() < 4, path.name
+
+
+def test_collected_files_of_programs_are_as_their_twin(shared_cases: Path) -> None:
+    folder = shared_cases / "round5" / "stills"
+    twins = [one_frame(folder / name).pixels for name in ("twin.jpg", "twin6.jpg")]
+    for path in sorted({*folder.iterdir()} - {*folder.glob("*.sh"), *folder.glob("*.md")}):
+        frame = one_frame(path)
+        [twin] = [pixels for pixels in twins if pixels.shape == frame.pixels.shape]
+        values = frame.pixels / frame.white
+        if frame.linear:
+            values = np.minimum((values / np.quantile(values, 0.99)) ** (1 / 2.2) * np.quantile(twin, 0.99) / 255, 1)
+        assert np.abs(255 * values - twin).mean() < 4, path.name
+        assert frame.metadata.orientation == (3 if re.search("orientation|exif", path.name) else 1), path.name
