@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from PIL import Image
 
 from rxcli.cli.simulate import simulate
-from rxcli.errors import ReceiverError
+from rxcli.errors import ReceiverError, UsageError
 from rxcli.ingest import open_source
 from rxcli.lab.simulate.camera import render_band
 from rxcli.lab.simulate.capture import prepare, simulate_frame
@@ -45,6 +45,21 @@ def test_a_clip_notes_how_its_camera_was_held(orientation: int, tmp_path: Path) 
     pictures = [np.zeros((32, 48, 3), np.uint8)] * 2
     write_video(pictures, tmp_path / "a.mp4", Encoding("h264"), 30, orientation=orientation)
     assert {frame.metadata.orientation for frame in open_source(tmp_path / "a.mp4")} == {orientation}
+
+
+def test_a_clip_of_an_odd_side_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"must be even \(got 48 x 31\)"):
+        write_video([np.zeros((31, 48, 3), np.uint8)], tmp_path / "a.mp4", Encoding("h264"), 30)
+
+
+def test_a_film_is_played_by_the_command(tmp_path: Path) -> None:
+    arguments = [*SMALL, "--preset", "video-1080p", "--screen", "paper-8k65", "--frames", "2", "--set", "panel=0"]
+    for name, film in (("rest.mp4", []), ("film.mp4", ["--film", "pan:40", "--set", "film.content_hz=30"])):
+        assert run(str(tmp_path / name), *arguments, *film).exit_code == 0
+    rest, film = ([frame.pixels for frame in open_source(tmp_path / name)] for name in ("rest.mp4", "film.mp4"))
+    assert (rest[1] != film[1]).any()
+    refused = run(str(tmp_path / "no.mp4"), *arguments, "--film", "tilt:4")
+    assert isinstance(refused.exception, UsageError)
 
 
 @pytest.mark.parametrize("cfa", ["bayer", "xtrans"])

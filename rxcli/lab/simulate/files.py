@@ -194,7 +194,7 @@ def write_video(
         orientation: EXIF orientation of a camera held upright or upside down, 1 or 3, which the container notes.
 
     Raises:
-        UsageError: this machine's FFmpeg lacks the codec.
+        UsageError: this machine's FFmpeg lacks the codec, or a side is odd.
     """
     settings, rate = CODECS[encoding.codec], Fraction(frame_rate_hz).limit_denominator(1001)
     ranges: dict[str, Any] = {"src_color_range": _JPEG_RANGE, "dst_color_range": settings.colour_range}
@@ -216,6 +216,9 @@ def write_video(
 
 def _add_stream(container: Any, encoding: Encoding, rate: Fraction, shape: tuple[int, ...]) -> Any:
     settings = CODECS[encoding.codec]
+    if shape[0] % 2 or shape[1] % 2:
+        reason = f"{encoding.codec}: width and height must be even (got {shape[1]} x {shape[0]})"
+        raise UsageError(reason, "choose another scale or size")
     try:
         stream = container.add_stream(settings.encoder, rate=rate)
     except (av.error.FFmpegError, ValueError) as error:
