@@ -82,8 +82,9 @@ def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None
         cache = FrameCache(frame).in_blinking_colours()
         received = receive_either_way(cache, _in_total_order(options), _receive_still)
         soft = _with_cut_packets(cache, received, _in_total_order(options))
-    remarks = _with_part_in_view(received.result.remarks, soft)
-    received = received._replace(result=replace(received.result, soft_bits=soft, remarks=remarks))
+    result = _without_unlikely_screen(received.result, soft)
+    remarks = _with_part_in_view(result.remarks, soft)
+    received = received._replace(result=replace(result, soft_bits=soft, remarks=remarks))
     if on_taps is not None and received.taps:
         on_taps(frame.source, frame.index, received.taps)
     claims = ", ".join(frame.metadata.not_believed) if received.result.packets else ""
@@ -185,6 +186,14 @@ def _with_cut_packets(cache: FrameCache, received: Received, options: ReceiverOp
     cut = cut_packets(context, families)
     likeliest, *less_likely = (*cut, *([own] if own else ())) or (None,)
     return None if likeliest is None else replace(likeliest, alternatives=tuple(less_likely))
+
+
+def _without_unlikely_screen(result: FrameResult, soft: FrameSoftBits | None) -> FrameResult:
+    """The result without a screen whose packets did not show, if the light is rather a part of another's."""
+    own = result.soft_bits
+    if result.status != "no_signal" or own is None or soft is None or soft.llr.shape[1] == own.llr.shape[1]:
+        return result
+    return replace(result, columns=(), screen_profile=None, remarks=(Remark("no_headers"),))
 
 
 def _with_part_in_view(remarks: tuple[Remark, ...], soft: FrameSoftBits | None) -> tuple[Remark, ...]:

@@ -230,8 +230,8 @@ def table_rows(result: FrameResult, clip: bool, scored: bool) -> list[str]:
         scored: whether wrong bits are counted.
     """
     rows: list[str] = []
-    # Columns with packets stand alone.
-    groups = groupby(result.columns, key=lambda c: c.column if c.packets else (c.status, c.message))
+    # Columns with packets stand alone; of one reason the first is shown, whose figures are about those of the others.
+    groups = groupby(result.columns, key=lambda c: c.column if c.packets else (c.status, c.reason or c.message))
     for column, *equal in (list(group) for _, group in groups):
         if column.packets:
             packets = packet_rows(replace(result, columns=(column,)))

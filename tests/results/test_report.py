@@ -19,7 +19,7 @@ from rxcli.results.record import from_record, to_json_line, to_record
 from rxcli.results.report import format_frame, headline, printable_name
 from rxcli.results.summary import Limits, SourceSummary, exit_code, format_summary, write_junit, write_summary
 from rxcli.results.truth import Score
-from rxcli.types import ColumnResult, FrameResult, Message, PacketResult
+from rxcli.types import ColumnResult, FrameResult, Message, PacketResult, Remark
 
 PACKET = PacketResult(412.6, 2.76, 168, "d076558cfe9de2d3cbb042f32dc440df474e5a5d9c", 0.998, 1.23e-5)
 OK = FrameResult(
@@ -139,6 +139,16 @@ def test_the_table_shows_what_a_person_looks_for() -> None:
     assert first.index("d076") == header.index("payload")
     assert dark.split(maxsplit=2) == ["1-2", "dark", "too little light; expose longer"]
     assert format_frame(BAD) == "c.jpg | unreadable\n  the file is empty\n  copy it again"
+
+
+def test_columns_of_one_reason_share_a_row() -> None:
+    """Whose figures may differ a little."""
+    columns = tuple(
+        ColumnResult(n, "no_packet", remark=Remark("incomplete"), message=f"of 70 slots {25 + n // 5} are missing")
+        for n in range(20)
+    )
+    rows = format_frame(replace(OK, status="no_signal", columns=columns)).splitlines()[2:]
+    assert [row.split(maxsplit=2) for row in rows] == [["0-19", "no_packet", "of 70 slots 25 are missing"]]
 
 
 def summary(*results: FrameResult, score: Score | None = None) -> SourceSummary:

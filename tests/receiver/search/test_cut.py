@@ -25,7 +25,17 @@ from rxcli.receiver.search.cameras import estimated_camera, relabelled_camera
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
 from rxcli.results.reasons import sentence_of
-from rxcli.types import Clock, Frame, FrameResult, FrameSoftBits, Metadata, Remark, RowProfiles, SearchStep
+from rxcli.types import (
+    Clock,
+    ColumnResult,
+    Frame,
+    FrameResult,
+    FrameSoftBits,
+    Metadata,
+    Remark,
+    RowProfiles,
+    SearchStep,
+)
 
 SCREEN = load_profile("data-17k3", ScreenProfile)
 
@@ -72,6 +82,17 @@ def test_the_message_names_the_share_of_a_packet_in_view() -> None:
     assert kept == remarks[0]
     assert "36 % of a packet: send 3 more photos, or film" in sentence_of(part)
     assert receive._with_part_in_view(remarks, None) == remarks
+
+
+def test_a_screen_whose_packets_did_not_show_is_left_out_where_a_part_of_anothers_is_likelier() -> None:
+    own, part = (FrameSoftBits(np.arange(1), np.ones((1, n, 20, 7), np.float32)) for n in (5, 11))
+    columns = (ColumnResult(0, "no_packet", remark=Remark("unsure")),)
+    result = FrameResult("photo", 0, 0.0, "no_signal", screen_profile="paper-8k65", columns=columns, soft_bits=own)
+    shown = receive._without_unlikely_screen(result, part)
+    assert (shown.screen_profile, shown.columns, shown.reason) == (None, (), "no_headers")
+    for likely in (result, replace(result, status="partial")):
+        soft = own if likely is result else part
+        assert receive._without_unlikely_screen(likely, soft) is likely
 
 
 def seen(monkeypatch: pytest.MonkeyPatch, by_outline: list[RowProfiles]) -> list[FrameContext]:
