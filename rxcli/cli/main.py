@@ -108,8 +108,8 @@ def cli(context: click.Context) -> None:
     Try it: vlc-rx demo. Then vlc-rx decode photo.jpg, or vlc-rx inspect photo.jpg for a page that shows what was seen,
     or vlc-rx serve for photos from a phone.
 
-    stdout carries data only; logs and progress go to stderr. Exit codes: 0 every input gave a packet, 1 some input gave
-    none, 2 bad usage or profile, 3 an input could not be read or an output could not be written, 130 interrupted, 143
+    stdout carries data only; logs and progress go to stderr. Exit codes: 0 every input gave a packet or a text, 1 some
+    gave none, 2 bad usage or profile, 3 an input could not be read or an output could not be written, 130 interrupted, 143
     terminated.
     """
     from rxcli.resources import user_dir
