@@ -258,7 +258,7 @@ def test_a_clip_whose_speed_was_changed_is_received_frame_by_frame(shaky: Clip) 
     assert all("do not fit the link's time" in (result.message or "") for result in results)
     right = [p for r in results for c in r.columns for p in c.packets if p.bit_errors == 0]
     assert len(right) >= 0.5 * 20 * len(frames)
-    assert surely_wrong(results) <= 1
+    assert surely_wrong(results) == 0
 
 
 def test_a_variable_frame_rate() -> None:
@@ -338,7 +338,7 @@ def test_a_stabilised_clip_of_a_named_camera_says_so(speed_px: float, seed: int)
     results, score = received(filmed(scene_in_hand(speed_px, stabilised=True, pose=pose), seed))
     assert all("1.06" in (result.message or "") and "stabilis" in (result.message or "") for result in results)
     assert score.error_free >= 0.85 * score.expected
-    assert surely_wrong(results) <= 1  # Of some 150: rows are not where the light model has them.
+    assert surely_wrong(results) == 0
 
 
 @pytest.mark.parametrize("is_closer", [False, True])
@@ -349,7 +349,7 @@ def test_a_step_of_the_zoom(shaky: Clip, is_closer: bool) -> None:
     results, score = received(shaky, (*first[0][:6], *second[0][6:]))
     assert score.error_free >= 0.85 * score.expected
     # One of 180 may be: other versions of OpenCV and NumPy draw the clip a little differently.
-    assert surely_wrong(results) <= 1
+    assert surely_wrong(results) <= (0 if is_closer else 1)
 
 
 def test_a_step_of_the_white_balance(shaky: Clip) -> None:
@@ -370,7 +370,7 @@ def test_two_clips_cut_together(shaky: Clip) -> None:
     for part, truth in ((results[:8], shaky[1]), (results[8:], other[1])):
         scorer = Scorer(truth)
         marked = [scorer.add(replace(result, frame=result.frame % 8)) for result in part]
-        assert surely_wrong(marked) <= 1  # of some 110
+        assert surely_wrong(marked) == 0
         shown = [b.burst for f in truth.frames[:8] for b in f.bursts if b.visible_slots >= 72]
         right = [p for r in marked for c in r.columns for p in c.packets if p.bit_errors == 0]
         assert len(right) >= 0.85 * 20 * len(set(shown))

@@ -46,7 +46,7 @@ def receive_either_way(cache: FrameCache, options: ReceiverOptions, receive: _Re
     if attempts:
         (*_, quarter_turns), best = max(attempts, key=lambda attempt: attempt[0])
         return best.with_remark(Remark("turned_counterclockwise" if quarter_turns == 1 else "turned_clockwise"))
-    remarks = likeliest_reason(frame, received.result, options)
+    remarks = likeliest_reason(cache, received.result, options)
     if remarks and remarks[0].reason in ("portrait", "on_its_side"):
         # Packets that are not believable are none then.
         nothing = FrameResult(frame.source, frame.index, frame.time_s, "ok")

@@ -163,10 +163,15 @@ def whole_picture(frame: Frame) -> FloatArray:
     return geometry.viewer_order(corners, frame.metadata.orientation)
 
 
+def lean_of(cache: FrameCache) -> float:
+    """See `stripe_lean`."""
+    return cache.once("lean", lambda: stripe_lean(cache.frame.pixels))
+
+
 def may_be_turned(cache: FrameCache, options: ReceiverOptions) -> bool:
     """Whether a photograph may have been turned after it was taken: its stripes run downwards, as its rows do."""
     frame = cache.frame
-    if not may_fill(frame) or frame.mosaic is not None or stripe_lean(frame.pixels) > -MIN_LEAN:
+    if not may_fill(frame) or frame.mosaic is not None or lean_of(cache) > -MIN_LEAN:
         return False
     layouts = [layout for layout in layouts_of(options) if not layout.is_narrow]
     shown = (screen[0] for screen in possible_screens(cache, options))
@@ -192,7 +197,7 @@ def reason_for_none(cache: FrameCache) -> Remark:
     useless = find.why_useless(frame.pixels, black, white)
     if useless is not None:
         return useless
-    is_striped = levels is None and stripe_lean(frame.pixels) > MIN_LEAN
+    is_striped = levels is None and lean_of(cache) > MIN_LEAN
     common = common_light(frame) if is_striped else None
     mean = float(find.thinned(frame.pixels, black, white).mean())
     # Rows have noise in common in the dark.

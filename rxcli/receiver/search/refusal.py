@@ -10,33 +10,34 @@ from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.decode.steady import is_common_light, periodic_share
 from rxcli.receiver.frame.acquisition import noise_of
+from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception, dark_columns, shows_steady_light
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.frame.settings import SETTINGS as PASSES
 from rxcli.receiver.plane.orientation import PORTRAIT
-from rxcli.receiver.screen.stripes import MIN_LEAN, common_stripes, stripe_lean
+from rxcli.receiver.screen.stripes import MIN_LEAN, common_stripes
 from rxcli.receiver.search.hypothesis import Hypothesis
-from rxcli.receiver.search.outlines import common_light, too_small
+from rxcli.receiver.search.outlines import common_light, lean_of, too_small
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import as_one_column
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import BELIEVABLE, Frame, FrameResult, Remark, RowProfiles
+from rxcli.types import BELIEVABLE, FrameResult, Remark, RowProfiles
 
 #: Reasons that nothing makes likelier.
 _PLAIN = ("steady_light", "one_lamp", "black", "saturated", "few_pixels", "too_tall", "portrait")
 
 
-def likeliest_reason(frame: Frame, result: FrameResult, options: ReceiverOptions) -> tuple[Remark, ...]:
+def likeliest_reason(cache: FrameCache, result: FrameResult, options: ReceiverOptions) -> tuple[Remark, ...]:
     """Remarks on a refusal that begin with what is likeliest: a long exposure, a camera on its side, or no such screen.
 
     Args:
-        frame: the picture.
+        cache: the picture.
         result: without a believable packet.
         options: with the screens that were tried.
     """
-    metadata, remarks = frame.metadata, result.remarks or (Remark("unsure"),)
+    frame, metadata, remarks = cache.frame, cache.frame.metadata, result.remarks or (Remark("unsure"),)
     # A packet of an uncertain column is still a packet.
     is_sent = any(packet.confidence > BELIEVABLE * result.column_certainty for packet in result.packets)
     if is_sent or result.reason in _PLAIN or frame.mosaic is not None:
@@ -45,7 +46,7 @@ def likeliest_reason(frame: Frame, result: FrameResult, options: ReceiverOptions
     slots = exposure_s * min(screen.slot_rate_hz for screen in options.screens)
     if slots > SETTINGS.max_named_slots:
         return (Remark("long_exposure", {"exposure_s": exposure_s, "slots": slots}),)
-    lean = stripe_lean(frame.pixels)
+    lean = lean_of(cache)
     if lean > MIN_LEAN and metadata.orientation in PORTRAIT:
         return (Remark("portrait", {"orientation": metadata.orientation}),)
     if lean < -MIN_LEAN and common_stripes(frame.pixels.T)[0] > SETTINGS.min_common_light:
