@@ -109,8 +109,8 @@ def cli(context: click.Context) -> None:
     or vlc-rx serve for photos from a phone.
 
     stdout carries data only; logs and progress go to stderr. Exit codes: 0 every input gave a packet or a text, 1 some
-    gave none, 2 bad usage or profile, 3 an input could not be read or an output could not be written, 130 interrupted, 143
-    terminated.
+    gave none, 2 bad usage or profile, 3 an input could not be read or an output could not be written, 130 interrupted,
+    143 terminated.
     """
     from rxcli.resources import user_dir
 
