@@ -197,7 +197,6 @@ def _clocks(
     straight = straightened(strips, level, curvature)
     columns = columns_of(straight, strips.n_columns)
     n_rows, pitch = columns.shape[1], strips.pitch
-    correlation = _autocorrelation(columns)
     # Of the light itself: soft signs have steeper edges.
     half_width = _half_width(_autocorrelation(straight.reshape(strips.n_columns, -1, n_rows).mean(axis=1)))
     shortest, longest = _slot_range(width, pitch)
@@ -207,7 +206,7 @@ def _clocks(
     lines = _FINE * n_rows / (low + _peaks(line[low : high + 2], SETTINGS.n_peaks, 2 * _FINE))
     # Light exposed for about a slot has a stronger line at twice the rate.
     harmonics = _FINE * np.array([1, 2])
-    copies = _surprise(correlation, round(2 * SLOTS_PER_SYMBOL * shortest))
+    copies = _surprise(_autocorrelation(_from_their_tops(columns)), round(2 * SLOTS_PER_SYMBOL * shortest))
     total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
     for length, exposure in exposures.items():
         low, high = (int(rows * length) for rows in (shortest, longest))
@@ -238,7 +237,7 @@ def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_be
         bends = bends or [np.zeros(4)] + ([likeliest_bend(strips, change)] if may_bend else [])
         for curvature in bends:
             columns = columns_of(straightened(strips, change, curvature), strips.n_columns)
-            copies = _surprise(_autocorrelation(columns), round(2 * SLOTS_PER_SYMBOL * rows))
+            copies = _surprise(_autocorrelation(_from_their_tops(columns)), round(2 * SLOTS_PER_SYMBOL * rows))
             total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
             for length, exposure in exposures.items():
                 if rows * (length - PREAMBLE_SLOTS) <= columns.shape[1]:
@@ -417,6 +416,14 @@ def _autocorrelation(columns: Float32Array, later: Float32Array | None = None) -
     spectrum = np.fft.rfft(columns, size, axis=1)
     beside = spectrum if later is None else np.fft.rfft(later, size, axis=1)
     return np.asarray(np.fft.irfft((spectrum * beside.conj()).real.sum(axis=0), size)[:n])
+
+
+def _from_their_tops(columns: Float32Array) -> Float32Array:
+    """Columns (C, R) from the first row of each on, as many as the longest has: leaning ones share few."""
+    shown, n_rows = columns != 0, columns.shape[1]
+    top, bottom = shown.argmax(axis=1), (n_rows - shown[:, ::-1].argmax(axis=1)) * shown.any(axis=1)
+    rows = top[:, None] + np.arange(int((bottom - top).max()) or n_rows)
+    return np.asarray(np.take_along_axis(columns, rows % n_rows, axis=1) * (rows < n_rows), np.float32)
 
 
 def _surprise(correlation: FloatArray, shortest: int) -> FloatArray:

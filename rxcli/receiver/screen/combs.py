@@ -8,7 +8,6 @@ needs no edge of the screen, no light spread and no decoding.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,9 +52,13 @@ class Comb:
 
 
 def find_combs(strips: PictureStrips) -> list[Comb]:
-    """The strongest combs of a picture or of a part of it, strongest first; none if the strongest may be chance."""
+    """The strongest combs of a picture or of a part of it, strongest first; none if the strongest may be chance.
+
+    Args:
+        strips: without the light that all columns share.
+    """
     chosen: list[Comb] = []
-    for comb in sorted(_all_combs(strips.without_common_light()), key=lambda comb: -comb.score):
+    for comb in sorted(_all_combs(strips), key=lambda comb: -comb.score):
         if not any(comb.is_like(earlier) for earlier in chosen):
             chosen.append(comb)
         if len(chosen) == _N_COMBS or chosen[0].score <= _MIN_COMB:
@@ -66,10 +69,12 @@ def find_combs(strips: PictureStrips) -> list[Comb]:
 def grid_of_comb(comb: Comb, strips: PictureStrips) -> Grid:
     """The grid of the whole picture that is nearest to a comb of some strips."""
     raw_x, raw_y, x, y = (values.ravel() for values in (strips.raw_x, strips.raw_y, strips.x, strips.y))
-    local_x, local_y = (raw_x - raw_x.mean()) * strips.n_parts, raw_y * strips.n_parts
+    middle, course = float(raw_x.mean()), strips.course
+    local_x, local_y = course.across(raw_x - middle, raw_y) * strips.n_parts, raw_y * strips.n_parts
     bent = local_x + comb.turn * local_y + comb.across * local_x**2 + comb.along * local_x * local_y
     pitch = comb.pitch * strips.n_parts
-    numbers = np.array([comb.phase - pitch * raw_x.mean(), pitch, pitch * comb.turn, 0.0, 0.0, 0.0])
+    turn = comb.turn + course.turn
+    numbers = np.array([comb.phase - pitch * middle, pitch, pitch * turn, course.g, course.h, 0.0])
     grid = Grid(numbers, strips.width, strips.height, strips.lens)
     return grid_through(grid, x, y, comb.phase + comb.pitch * bent)
 
@@ -92,7 +97,9 @@ def _all_combs(strips: PictureStrips) -> list[Comb]:
         # Pairs across a border are less coherent. Combs are scaled to their standard deviation by chance, so that
         # different distances can be compared.
         rest /= np.float32(-chance)
-        found += _best_combs(rest, step, y, tried, strips.n_parts)
+        x = np.broadcast_to((np.arange(rest.shape[1]) - (rest.shape[1] - 1) / 2) * step, rest.shape)
+        x = strips.course.across(x, y[:, None])
+        found += _best_combs(rest, x, y, tried, strips.n_parts)
     return found
 
 
@@ -102,11 +109,12 @@ def _range(largest: float, at_corner: float) -> FloatArray:
     return np.linspace(-largest, largest, 2 * n + 1)
 
 
-def _best_combs(rest: Float32Array, step: float, y: FloatArray, pitches: FloatArray, n_parts: int) -> list[Comb]:
+def _best_combs(rest: Float32Array, x: FloatArray, y: FloatArray, pitches: FloatArray, n_parts: int) -> list[Comb]:
     """The best comb of each pitch, from values (W, n) of pairs of strips: sum along the strips, then over windows."""
     largest, half_x, half_y = float(pitches[-1]), 0.5, float(np.abs(y).max())
-    if _MAX_TURN * largest * (y[1] - y[0]) < _STEP and len(y) % 2 == 0:
-        rest, y = rest[::2] + rest[1::2], (y[::2] + y[1::2]) / 2
+    is_upright = bool((x == x[0]).all())
+    if is_upright and _MAX_TURN * largest * (y[1] - y[0]) < _STEP and len(y) % 2 == 0:
+        rest, y, x = rest[::2] + rest[1::2], (y[::2] + y[1::2]) / 2, x[::2]
     turns = _range(_MAX_TURN, largest * half_y)
     across = _range(_MAX_ACROSS / n_parts, largest * half_x**2)
     along = _range(_MAX_ALONG / n_parts, largest * half_x * half_y)
@@ -115,9 +123,13 @@ def _best_combs(rest: Float32Array, step: float, y: FloatArray, pitches: FloatAr
     n_frequencies = int(np.ceil((largest + reach) / spacing)) - start + 1
     own = pitches[:, None, None] * (1 + along[:, None] * y)
     nearest = np.round(own / spacing).astype(np.int64) - start
-    x = (np.arange(rest.shape[1]) - (rest.shape[1] - 1) / 2) * step
-    bent = rest * _turned(float(pitches.mean()) * np.multiply.outer(across, x * x))[:, None]
-    along_strips = np.matmul(bent, _waves(rest.shape[1], step, start, n_frequencies))
+    bent = rest * _turned(float(pitches.mean()) * np.multiply.outer(across, x * x))
+    frequencies = (start + np.arange(n_frequencies)) * spacing
+    if is_upright:
+        along_strips = np.matmul(bent, _turned(np.outer(x[0], frequencies)))
+    else:
+        waves = _turned(np.multiply.outer(x, frequencies))
+        along_strips = np.matmul(bent.transpose(1, 0, 2), waves).transpose(1, 0, 2)
     over_windows = _turned(pitches[:, None, None] * np.multiply.outer(y, turns))
     out = []
     for number, pitch in enumerate(pitches.tolist()):  # together they would take gigabytes in tall pictures
@@ -128,13 +140,6 @@ def _best_combs(rest: Float32Array, step: float, y: FloatArray, pitches: FloatAr
         shape = float(turns[k]), float(across[i]), float(along[j])
         out.append(Comb(float(np.sqrt(power[i, j, k])), pitch, *shape, phase))
     return out
-
-
-@lru_cache(maxsize=32)
-def _waves(n: int, step: float, start: int, n_frequencies: int) -> NDArray[np.complex64]:
-    """(n, F) complex waves at pairs of strips with spacing `step`, from the frequency with index `start` on."""
-    x = (np.arange(n) - (n - 1) / 2) * step
-    return _turned(np.outer(x, (start + np.arange(n_frequencies)) * (_STEP / 2)))
 
 
 def _turned(turns: FloatArray) -> NDArray[np.complex64]:

@@ -6,7 +6,7 @@ identify the first column (`numbering`); light along the columns gives the first
 proposes outlines with log-odds and leaves the decision to the search.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import find_combs, grid_of_comb
+from rxcli.receiver.screen.courses import tilted_course
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.rows import find_rows
-from rxcli.receiver.screen.strips import PictureStrips, read_strips, shows_narrow_columns
+from rxcli.receiver.screen.strips import UPRIGHT, Course, PictureStrips, read_strips, shows_narrow_columns
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
 from rxcli.types import Float32Array, FloatArray, Lens, LightPlane, Remark
 
@@ -38,6 +39,8 @@ _PLAIN_CONTRAST, _N_FITTED = 0.22, 3
 #: Weights of the light that a grid explains and of its perspective in its score, against 1 for its contrast: fitted to
 #: the grids of 186 simulated scenes, one in four of a night, such that no bright one loses its own.
 _BY_EXPLAINED, _BY_PERSPECTIVE = 7.0, -1.0
+#: Score that a screen costs which is seen from the side, however far: one picture in twenty.
+_FROM_THE_SIDE = -0.3
 #: Score by which grids between the sides of a bright part are ahead of those of combs.
 _OF_PART = 0.4
 #: Contrast of one screen's grid, as a share of that of two, from which there is one: over two it has that of one alone.
@@ -49,8 +52,12 @@ _POSSIBLE_CONTRAST = 0.5
 _NEARLY_BEST, _SECOND, _DIFFERENT = 0.3, -25.0, 0.2
 #: Log-odds relative to the likeliest first column down to which another one is possible.
 _MIN_LOG_ODDS = -7.0
+#: Most rounds in which the course of columns that lean is found, and its change that ends them.
+_COURSES, _SAME_COURSE = 4, 0.1
 #: Number of unlit columns at a side from which the side counts as not visible.
 _UNLIT_COLUMNS = 0.5
+#: Strips and a grid of their columns.
+_Placed = tuple[PictureStrips, Grid]
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +103,12 @@ def find_screens(
         return []
     size = (plane.width, plane.height)
     rivals = [grid_between(corners, wide[0].n_columns, size, lens) for corners in parts]
-    grids = wide_grids(strips, wide[0].sigma, rivals, _POSSIBLE_CONTRAST)
-    found = [candidate for rank, grid in enumerate(grids) for candidate in _numbered(strips, grid, wide, parts, rank)]
+
+    def along(course: Course) -> PictureStrips:
+        return read_strips(plane, lens, course=course)
+
+    placed = wide_grids(strips, wide[0].sigma, rivals, _POSSIBLE_CONTRAST, along)
+    found = [candidate for rank, own in enumerate(placed) for candidate in _numbered(*own, wide, parts, rank)]
     return [sorted(found, key=lambda candidate: -candidate.log_odds)] if found else []
 
 
@@ -122,11 +133,11 @@ def _screens_apart(strips: PictureStrips, layouts: Sequence[ColumnLayout]) -> li
         return float(np.ptp(_light_across(part, grid, layouts[0].sigma)[1].ends))
 
     sides, too_many = strips.sides_of_gap(), max(layout.n_columns for layout in layouts) + 1
-    found = [(side, grid) for side in sides for grid in wide_grids(side, layouts[0].sigma)[:1]]
+    found = [own for side in sides for own in wide_grids(side, layouts[0].sigma)[:1]]
     if len(found) < 2 or sum(n_lit(side, grid) for side, grid in found) < too_many:
         return []
     together = sum(grid.contrast for _, grid in found)
-    for grid in wide_grids(strips, layouts[0].sigma)[:1]:
+    for _, grid in wide_grids(strips, layouts[0].sigma)[:1]:
         if grid.contrast > _ONE_SCREEN * together and n_lit(strips, grid) < too_many:
             return []
     clearest_first = sorted(found, key=lambda side_and_grid: -side_and_grid[1].explained)
@@ -162,35 +173,92 @@ def thinned(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white:
     return np.asarray((pixels[*steps] - np.float32(black)) / (white - black), np.float32)
 
 
-def wide_grids(strips: PictureStrips, sigma: float, rivals: Sequence[Grid] = (), least: float = 1.0) -> list[Grid]:
+def wide_grids(
+    strips: PictureStrips,
+    sigma: float,
+    rivals: Sequence[Grid] = (),
+    least: float = 1.0,
+    along: Callable[[Course], PictureStrips] | None = None,
+) -> list[_Placed]:
     """The grid of wide columns that explains the strips' light best, and one that does nearly as well, if any.
 
     Args:
-        strips: of the picture.
+        strips: of the picture, upright.
         sigma: light spread of the screen, column pitches.
         rivals: grids that compete with those of the combs, unless the strongest comb's is plain.
         least: minimum contrast, times what chance gives.
+        along: reads the strips of the picture along columns that lean; None if only upright ones are sought.
     """
-    some, combs = strips.blocks(slice(None, None, 2)), find_combs(strips)
+    quiet = strips.without_common_light()
+    starts = _starts(strips, quiet, sigma)
+    is_plain = bool(starts) and starts[0][1].contrast >= _PLAIN_CONTRAST * starts[0][1].explained
+    if is_plain:
+        starts = starts[:1]
+    else:
+        starts += [(strips, rival) for rival in rivals if with_light(_half(strips), rival, sigma).contrast > 0]
+        course = along and tilted_course(quiet)
+        if along and course:
+            starts += _leaning_starts(along, course, sigma)
+    # A part of the picture with four straight sides is mostly the screen where its borders stand out nearly as well.
+    ahead = [_OF_PART * any(grid is rival for rival in rivals) for _, grid in starts]
+    placed = [_fitted(own, grid, sigma, along) for own, grid in starts]
+    scored = [(_score(own[1]) + more, own) for own, more in zip(placed, ahead, strict=True)]
+    scored = sorted((own for own in scored if _stands_out(*own[1], least)), key=lambda own: -own[0])
+    if not scored:
+        return []
+    score, likeliest = scored[0]
+    # Of grids with the same columns the likeliest is nearest to them.
+    best = max((own for _, own in scored if not _differ(own, likeliest)), key=lambda own: _likelihood(own[1]))
+    # About one course of columns that lean the nearly likeliest is the likeliest, not yet in its place.
+    second = [
+        rival
+        for own, rival in scored
+        if own >= score - _NEARLY_BEST
+        and _differ(rival, likeliest)
+        and UPRIGHT in (rival[0].course, likeliest[0].course)
+    ]
+    return [best, *second[:1]]
+
+
+def _starts(strips: PictureStrips, quiet: PictureStrips, sigma: float) -> list[_Placed]:
+    """Grids of the strongest combs, the strongest first if it is plain, else the likeliest."""
+    some, combs = _half(strips), find_combs(quiet)
     starts = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[:1]]
     if not starts or starts[0].contrast < _PLAIN_CONTRAST * starts[0].explained:
         starts += [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
         # Contrast needs borders that are in their place already.
         starts = sorted(starts, key=_likelihood, reverse=True)[:_N_FITTED]
-        starts += [rival for rival in rivals if with_light(some, rival, sigma).contrast > 0]
-    # A part of the picture with four straight sides is mostly the screen where its borders stand out nearly as well.
-    ahead = [_OF_PART * any(grid is rival for rival in rivals) for grid in starts]
-    near = [moved_by_waveforms(some, grid, sigma, _FIRST_STEPS) for grid in starts]
-    fitted = [with_light(strips, moved_by_waveforms(strips, grid, sigma, _LAST_STEPS), sigma) for grid in near]
-    scored = [(_score(grid) + more, grid) for grid, more in zip(fitted, ahead, strict=True)]
-    scored = sorted((own for own in scored if _stands_out(strips, own[1], least)), key=lambda own: -own[0])
-    if not scored:
-        return []
-    score, likeliest = scored[0]
-    # Of grids with the same columns the likeliest is nearest to them.
-    best = max((grid for _, grid in scored if not _differ(strips, grid, likeliest)), key=_likelihood)
-    second = [grid for own, grid in scored if own >= score - _NEARLY_BEST and _differ(strips, grid, likeliest)]
-    return [best, *second[:1]]
+    return [(strips, grid) for grid in starts]
+
+
+def _leaning_starts(along: Callable[[Course], PictureStrips], course: Course, sigma: float) -> list[_Placed]:
+    """The best grids about a course of the columns, and about that of the best grid in turn."""
+    found: list[_Placed] = []
+    for _ in range(_COURSES):
+        strips, before = along(course), course
+        some = _half(strips)
+        for _, grid in _starts(strips, strips.without_common_light(), sigma):
+            found.append((strips, with_light(some, moved_by_waveforms(some, grid, sigma, _FIRST_STEPS), sigma)))
+        found = sorted(found, key=lambda own: -_score(own[1]))[:_N_FITTED]
+        course = found[0][1].course if found else course
+        if course.distance(before) < _SAME_COURSE:
+            break
+    return found
+
+
+def _half(strips: PictureStrips) -> PictureStrips:
+    """Every second window."""
+    return strips.blocks(slice(None, None, 2))
+
+
+def _fitted(
+    strips: PictureStrips, grid: Grid, sigma: float, along: Callable[[Course], PictureStrips] | None
+) -> _Placed:
+    """A grid moved to its columns; strips that lean are read anew along them."""
+    grid, n_steps = moved_by_waveforms(_half(strips), grid, sigma, _FIRST_STEPS), _LAST_STEPS
+    if along and strips.course != UPRIGHT:
+        strips, n_steps = along(grid.course), _FIRST_STEPS
+    return strips, with_light(strips, moved_by_waveforms(strips, grid, sigma, n_steps), sigma)
 
 
 def _likelihood(grid: Grid) -> float:
@@ -206,13 +274,14 @@ def _score(grid: Grid) -> float:
     """
     if min(grid.contrast, grid.explained) <= 0:
         return -np.inf
-    perspective = float(np.square(grid.coefficients[3:5]).sum())
-    return float(np.log(grid.contrast) + _BY_EXPLAINED * np.log(grid.explained)) + _BY_PERSPECTIVE * perspective
+    perspective = _BY_PERSPECTIVE * float(np.square(grid.coefficients[3:5]).sum())
+    return float(np.log(grid.contrast) + _BY_EXPLAINED * np.log(grid.explained)) + max(perspective, _FROM_THE_SIDE)
 
 
-def _differ(strips: PictureStrips, grid: Grid, rival: Grid) -> bool:
+def _differ(placed: _Placed, rival: _Placed) -> bool:
     """Whether two grids differ in more than the number of the first column."""
-    off = columns_at(grid.coefficients, strips.x, strips.y) - columns_at(rival.coefficients, strips.x, strips.y)
+    strips, grid = placed
+    off = columns_at(grid.coefficients, strips.x, strips.y) - columns_at(rival[1].coefficients, strips.x, strips.y)
     return bool(np.abs(off - np.round(np.median(off))).mean() > _DIFFERENT)
 
 
@@ -220,7 +289,7 @@ def narrow_grid(strips: PictureStrips, sigma: float) -> Grid | None:
     """The grid of narrow columns, or None: parts of the picture are searched, and a clear grid is followed outwards."""
     some, few = (strips.blocks(slice(None, None, step)) for step in (2, 4))
     for part in sorted(range(strips.n_parts), key=lambda part: abs(part - strips.n_parts // 2)):
-        for comb in find_combs(strips.part(part))[:1]:
+        for comb in find_combs(strips.part(part).without_common_light())[:1]:
             own = few.part(part)
             grid = moved_by_waveforms(own, grid_of_comb(comb, strips.part(part)), sigma, _FIRST_STEPS)
             if not _stands_out(own, with_light(own, grid, sigma)):

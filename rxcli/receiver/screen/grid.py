@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.strips import flat_places
+from rxcli.receiver.screen.strips import Course, flat_places
 from rxcli.types import FloatArray, Lens
 
 #: Prior standard deviations of perspective and of radial distortion.
@@ -36,6 +36,12 @@ class Grid:
     #: half a column further on; 0 if not computed.
     explained: float = 0.0
     contrast: float = 0.0
+
+    @property
+    def course(self) -> Course:
+        """Course of the columns, without the lens."""
+        _, a, b, g, h, _ = self.coefficients.tolist()
+        return Course(b / a, g, h)
 
     @property
     def estimated_lens(self) -> Lens | None:

@@ -122,8 +122,7 @@ def light_profile(
     count, power = total(np.ones(1)), total(np.einsum("bsr,bsr->bs", light, light))
     share = total(light.sum(axis=2)) / np.sqrt(np.maximum(power * count * light.shape[2], TINY))
     coherent = np.clip(share * np.sqrt(count * strips.n_rows) / _SURE, 0, 1)
-    by_rows = light.mean(axis=(1, 2)).reshape(strips.n_parts, -1).mean(axis=0)
-    lit = np.tile(by_rows >= _LIT_ROWS * by_rows.max(), strips.n_parts)[:, None].astype(np.float64)
+    lit = _lit_rows(strips, light).astype(np.float64)
     n_lit = np.maximum(total(lit), 1)
     shown = total(lit) > 0
     is_faint, faint = _faint_light(total(lit * np.sqrt(np.maximum(strips.level, 0))) / n_lit, shown)
@@ -138,6 +137,14 @@ def light_profile(
     sides = np.stack([corners[:, [0, 3]].mean(axis=1), corners[:, [1, 2]].mean(axis=1)], axis=1)
     middle = float(grid.coefficients[0])
     return LightProfile(place, count > 0, coherent, level, steady, is_faint, faint, middle, sides)
+
+
+def _lit_rows(strips: PictureStrips, light: Float32Array) -> BoolArray:
+    """(B, S) whether strips lie between the first and the last rows of the columns' light, as columns lean."""
+    along = strips.course.along(strips.raw_x, strips.raw_y)
+    number = np.rint((along - along.min()) / (2 * strips.half_height)).astype(np.int64)
+    by_rows = np.bincount(number.ravel(), light.mean(axis=2).ravel()) / np.maximum(np.bincount(number.ravel()), 1)
+    return np.asarray((by_rows >= _LIT_ROWS * by_rows.max())[number])
 
 
 def _faint_light(root: FloatArray, shown: BoolArray) -> tuple[BoolArray, FloatArray]:

@@ -39,6 +39,38 @@ _OF_STRIPS = ("changes", "coherence", "level", "darkest", "raw_x", "raw_y", "x",
 
 
 @dataclass(frozen=True, slots=True)
+class Course:
+    """Course of columns through a picture: (X + turn Y) / (1 + g X + h Y) is the same all along a column.
+
+    X and Y are offsets from the picture's middle in picture widths.
+    """
+
+    turn: float = 0.0
+    g: float = 0.0
+    h: float = 0.0
+
+    def distance(self, course: Course) -> float:
+        """Largest difference in turn and perspective."""
+        return max(abs(self.turn - course.turn), abs(self.g - course.g), abs(self.h - course.h))
+
+    def across(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """(...) place across the columns, picture widths at its middle."""
+        return np.asarray((x + self.turn * y) / (1 + self.g * x + self.h * y))
+
+    def along(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """(...) place along the columns, roughly, picture widths at its middle."""
+        return np.asarray((y - self.turn * x) / (1 + self.g * x + self.h * y))
+
+    def slope(self, x: FloatArray, y: FloatArray) -> FloatArray:
+        """(...) shift in x of a column per row."""
+        above, below = x + self.turn * y, 1 + self.g * x + self.h * y
+        return np.asarray((self.h * above - self.turn * below) / (below - self.g * above))
+
+
+UPRIGHT = Course()
+
+
+@dataclass(frozen=True, slots=True)
 class PictureStrips:
     """B blocks of S strips of a picture, B = windows of rows x parts of the width, the windows of one part together."""
 
@@ -69,6 +101,8 @@ class PictureStrips:
     width: int
     height: int
     lens: Lens | None
+    #: Course of the columns that the strips follow within a window.
+    course: Course
 
     @property
     def n_windows(self) -> int:
@@ -119,22 +153,30 @@ class PictureStrips:
         return [self.blocks(np.s_[:, :end]), self.blocks(np.s_[:, start:])]
 
 
-def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1) -> PictureStrips:
+def read_strips(
+    plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1, course: Course = UPRIGHT
+) -> PictureStrips:
     """Strips of a picture, from its plane.
 
     Args:
         plane: of the picture; a tone curve need not be undone.
         lens: of the picture, if known.
         n_parts: parts of the width with strips of their own.
+        course: of the columns that the strips follow within each window of rows.
     """
     light, x = _light_of_strips(plane, n_parts)
     # Windows show no difference between columns and those turned by one column a window, so narrow ones need more.
     short, n_windows = _short_rows(light), _N_WINDOWS if n_parts == 1 else 2 * _N_WINDOWS
-    means = _means_of_rows(light, short, n_windows)
-    rows = means.shape[1] // n_windows
-    middles = (np.arange(n_windows) + 0.5) * rows * short - 0.5
+    n_rows = light.shape[1] // (short * n_windows)
+    middles = (np.arange(n_windows) + 0.5) * n_rows * short - 0.5
+    if course == UPRIGHT:
+        means, band = _band_passed(light, short, n_rows * n_windows)
+    else:
+        margin = LONG_ROWS * short
+        windows = _windows_along(plane, x, middles, n_rows * short, margin, course)
+        means, band = (part.reshape(len(light), -1) for part in _band_passed(windows, short, n_rows, margin))
     points = np.stack(np.meshgrid(x, middles), axis=-1)
-    changes, lit, noise = _without_row_noise(_windows(_band_passed(light, means, short), n_windows))
+    changes, lit, noise = _without_row_noise(_windows(band, n_windows))
 
     def parted(values: NDArray[Any]) -> NDArray[Any]:
         """(W, S, ...) as (parts x W, S / parts, ...)."""
@@ -142,13 +184,13 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
         return np.ascontiguousarray(np.moveaxis(split, 1, 0)).reshape(n_parts * n_windows, -1, *values.shape[2:])
 
     stored, flat = (flat_places(points, plane.width, plane.height, model) for model in (None, lens))
-    by_window = means.reshape(x.size, n_windows, rows)
+    by_window = means.reshape(x.size, n_windows, n_rows)
     level = _roughly_linear(plane, by_window.mean(axis=2).T)
     darkest = _roughly_linear(plane, by_window.min(axis=2).T)
     of_strips: list[NDArray[Any]] = [changes, lit, level, darkest, *stored, *flat]
     return PictureStrips(
         **{name: parted(values) for name, values in zip(_OF_STRIPS, of_strips, strict=True)},
-        half_height=rows * short / 2 / plane.width,
+        half_height=n_rows * short / 2 / plane.width,
         row_noise=noise,
         short_rows=short,
         n_rows=_independent_rows(changes, lit),
@@ -156,6 +198,7 @@ def read_strips(plane: LightPlane, lens: Lens | None = None, *, n_parts: int = 1
         width=plane.width,
         height=plane.height,
         lens=lens,
+        course=course,
     )
 
 
@@ -169,6 +212,30 @@ def _light_of_strips(plane: LightPlane, n_parts: int) -> tuple[Float32Array, Flo
     light = np.diff(plane.sums[start : start + n * cells + 1 : cells], axis=0)
     light /= np.float32(cells * plane.cell_px)
     return light, np.asarray((start + (np.arange(n) + 0.5) * cells) * plane.cell_px - 0.5)
+
+
+def _windows_along(
+    plane: LightPlane, x: FloatArray, middles: FloatArray, n_rows: int, margin: int, course: Course
+) -> Float32Array:
+    """(S * W, n_rows + 2 margin) mean values of strips that follow the columns in windows of rows.
+
+    Args:
+        plane: of the picture.
+        x: (S,) middles of the strips, pixels.
+        middles: (W,) middle rows of the windows, where the strips lie at x.
+        n_rows: rows of a window.
+        margin: rows before and after it that are read as well.
+        course: of the columns.
+    """
+    height, n_cells, n = plane.sums.shape[1], len(plane.sums) - 1, round((x[1] - x[0]) / plane.cell_px)
+    half = np.array([plane.width, height]) / 2 - 0.5
+    slope = course.slope((x[:, None] - half[0]) / plane.width, (middles - half[1]) / plane.width)[..., None]
+    row = np.rint(middles[:, None] + np.arange(-margin, n_rows + margin) - (n_rows - 1) / 2).clip(0, height - 1)
+    left = (x[:, None, None] + slope * (row - middles[:, None]) + 0.5) / plane.cell_px - n / 2
+    place = np.rint(left).clip(0, n_cells - n).astype(np.intp) * height + row.astype(np.intp)
+    flat = plane.sums.ravel()
+    light = (flat.take(place + n * height) - flat.take(place)) / np.float32(n * plane.cell_px)
+    return np.asarray(light.reshape(-1, n_rows + 2 * margin), np.float32)
 
 
 def _roughly_linear(plane: LightPlane, values: Float32Array) -> Float32Array:
@@ -196,20 +263,17 @@ def _lit_coherence(strips: PictureStrips, widths: float) -> float:
     return float((strips.coherence_at(distance) * share).sum() / (np.square(share).sum() + TINY))
 
 
-def _means_of_rows(light: Float32Array, short: int, n_windows: int) -> Float32Array:
-    """(S, R) means over `short` rows of light (S, rows), R a multiple of the number of windows."""
+def _band_passed(light: Float32Array, short: int, n: int, margin: int = 0) -> tuple[Float32Array, Float32Array]:
+    """(S, n) means over `short` rows of light (S, rows), and those less the means of `LONG_ROWS` times as many rows.
+
+    The first mean begins `margin` rows below the top.
+    """
     import cv2
 
-    n = light.shape[1] // (short * n_windows) * n_windows
-    return np.asarray(cv2.resize(light[:, : n * short], (n, len(light)), interpolation=cv2.INTER_AREA), np.float32)
-
-
-def _band_passed(light: Float32Array, means: Float32Array, short: int) -> Float32Array:
-    """(S, R) means over `short` rows, less the mean of `LONG_ROWS` times as many rows around them."""
-    import cv2
-
-    around = cv2.blur(light, (LONG_ROWS * short, 1))[:, short // 2 :: short]
-    return np.asarray(means - around[:, : means.shape[1]], np.float32)
+    rows = light[:, margin : margin + n * short]
+    means = np.asarray(cv2.resize(rows, (n, len(light)), interpolation=cv2.INTER_AREA), np.float32)
+    around = cv2.blur(light, (LONG_ROWS * short, 1))[:, margin + short // 2 :: short]
+    return means, np.asarray(means - around[:, :n], np.float32)
 
 
 def _short_rows(light: Float32Array) -> int:

@@ -61,7 +61,7 @@ def search(
         outlines = screens[0]
     found = _search(cache, options, known, outlines, may_bend, least)
     packets = _packet_evidence(found)
-    if outlines[0].family < 0 or (packets and outlines[0].stands_out):
+    if outlines[0].family < 0 or (packets and outlines[0].stands_out) or outlines[0].leans:
         return found
     without = without_borders(cache)
     if not without:

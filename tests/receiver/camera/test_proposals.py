@@ -318,3 +318,14 @@ def test_dark_columns_do_not_hide_the_width_of_the_stripes() -> None:
     places = np.zeros((40, n_rows)), np.arange(float(n_rows))
     strips = blind.ColumnStrips(light, np.ones_like(light), *places, 20, NoiseModel(1e-9, 1e-9), 4000, n_rows)
     assert 0.4 < stripe_rows(strips) / rows_per_slot < 1
+
+
+def test_columns_that_lean_are_compared_from_their_first_rows() -> None:
+    """Lags at which no column has rows left would make any repetition a surprise."""
+    rng, columns = np.random.default_rng(3), np.zeros((4, 500), np.float32)
+    light = rng.choice(np.array([-1, 1], np.float32), (4, 120))
+    for number, own in enumerate(light):
+        columns[number, 100 * number : 100 * number + 120] = own
+    np.testing.assert_array_equal(proposals._from_their_tops(columns), light)
+    assert proposals._surprise(proposals._autocorrelation(proposals._from_their_tops(columns)), 20)[1:].max() < 10
+    assert proposals._surprise(proposals._autocorrelation(columns), 20)[1:].max() > 1e3
