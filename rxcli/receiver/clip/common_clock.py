@@ -65,9 +65,10 @@ def common_clock(
     start, at = max(found, key=lambda each: each[0].log_evidence)
     if start.lead <= SETTINGS.min_lead:
         return None
-    # Screens that differ in their columns alone share a clock.
-    rivals = {(each.screen.slot_rate_hz, each.screen.packet_slots): each.log_evidence for each, _ in found}
-    rivals[start.screen.slot_rate_hz, start.screen.packet_slots] = start.log_evidence
+    # Screens that differ in their columns alone share a clock; so do some stretches of the time stamps.
+    rivals: dict[tuple[float, int], float] = {}
+    for each, _ in sorted(found, key=lambda each: each[0].log_evidence):
+        rivals[each.screen.slot_rate_hz, each.screen.packet_slots] = each.log_evidence
     certainty = 1 / np.exp(np.array(list(rivals.values())) - start.log_evidence).sum()
     return replace(start, certainty=float(certainty)), at
 
@@ -115,15 +116,19 @@ def _starts(frames: Sequence[Frame], context: FrameContext) -> Iterator[Start]:
     """The clock of each screen that all frames together show; `context` is of the first of them."""
     line_delay_s = context.camera.line_delay_s
     period_s, numbers = _period_s(frames), np.array([frame.index for frame in frames])
-    starts = (numbers - numbers[0]) * period_s / line_delay_s
     for screen in distinct_screens(context.screens):
         each = (replace(context, cache=FrameCache(frame, context.timer)) for frame in frames)
         profiles = [of_frame.sample_columns(screen.columns) for of_frame in each]
-        joined = _one_after_the_other(profiles, starts, screen.packet_s / line_delay_s)
-        slot, lead, log_evidence = _first_header(joined, screen, 1 / (screen.slot_rate_hz * line_delay_s))
-        time = LinkTime(screen.packet_slots, screen.slot_rate_hz)
-        time.begin(frames[0].index, frames[0].time_s, -slot, period_s * screen.slot_rate_hz)
-        yield Start(screen, variants_of(screen, context.screens), time, lead, log_evidence)
+        readout_s, variants = profiles[0].rows.size * line_delay_s, variants_of(screen, context.screens)
+        for stretch in range(1, min(sync_settings.max_stretch, max(int(period_s / readout_s), 1)) + 1):
+            frame_s = period_s / stretch
+            starts = (numbers - numbers[0]) * frame_s / line_delay_s
+            joined = _one_after_the_other(profiles, starts, screen.packet_s / line_delay_s)
+            slot, lead, log_evidence = _first_header(joined, screen, 1 / (screen.slot_rate_hz * line_delay_s))
+            time = LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
+            time.begin(frames[0].index, frames[0].time_s, -slot, frame_s * screen.slot_rate_hz)
+            log_evidence -= sync_settings.settled_llr * (stretch > 1)
+            yield Start(screen, variants, time, lead, log_evidence)
 
 
 def _first_header(profiles: RowProfiles, screen: ScreenProfile, rows_per_slot: float) -> tuple[float, float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from rxcli.receiver.decode.settings import SETTINGS as decode_settings
 from rxcli.receiver.light import slot_llr
 from rxcli.receiver.search.framing import log_odds
 from rxcli.receiver.sync import tracking
+from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.types import BoolArray, Clock, FloatArray, Frame, IntArray
 
 
@@ -38,12 +39,15 @@ class Timeline:
     stamps_judged: bool = False
     #: (1, C) log-likelihood ratio of the headers of all bursts so far; a scalar 0 before any.
     header_llr: FloatArray | float = 0.0
+    #: Slot of sensor row 0 from copy 0, and the copies' log-likelihood ratios, of the first frames.
+    first_copies: list[tuple[float, FloatArray]] = field(default_factory=list)
 
     @classmethod
     def begin(cls, view: View, start: Start | None, stretch: float) -> Timeline:
         """Begin with a frame; its time is that of `start` if the first frames agreed on one."""
         screen = view.acquisition.screen
-        time = start.time if start else tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
+        own = tracking.LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
+        time = start.time if start and start.time.stretch == stretch else own
         phase = tracking.BurstPhase(view.acquisition.repeats)
         prior = start.certainty if start else view.framing.prior if view.framing else 1.0
         return cls(
@@ -82,9 +86,12 @@ class Timeline:
             return False
         self.length_log_odds += 0.0 if view.framing is None else view.framing.gain
         view.first_copy, self.last_time_s = first_copy, frame.time_s
-        if not self.phase.settled:
+        is_judged = len(self.first_copies) >= sync_settings.n_judged_clocks
+        if not (self.phase.settled and is_judged):
             copies = view.clock.to_copies(slot_llr(view.metrics)).transpose(1, 0, 2)
-            self.phase.update(first_copy, np.asarray(copies * (view.shown > 0), np.float64))
+            shown = np.asarray(copies * (view.shown > 0), np.float64)
+            self.phase.update(first_copy, shown)
+            self.first_copies += [] if is_judged else [(tracking.slot_of_row_0(view.clock), shown)]
         return True
 
     def number(self, view: View) -> None:
@@ -105,7 +112,8 @@ class Timeline:
 
     def certainty(self, copies: IntArray) -> float:
         """Probability that packets have this length and that some copies of it, by their numbers, are one packet."""
-        return self.phase.certainty(copies) / (1 + float(np.exp(-self.length_log_odds)))
+        odds = np.array([self.length_log_odds, self.time.stretch_log_odds])
+        return self.phase.certainty(copies) / float(np.prod(1 + np.exp(-odds)))
 
     def predicted(self, frame: Frame, rows: FloatArray, rows_per_slot: float) -> list[int]:
         """Numbers of the bursts that the rows (R,) of a further frame should show; none if that is not known."""
@@ -125,7 +133,15 @@ class Timeline:
         self.stamps_judged = True
         shown = np.flatnonzero(view.acquisition.profiles.inside.any(axis=(0, 1)))
         readout_slots = float(np.ptp(shown)) / view.clock.rows_per_slot
-        return self.time.time_stamp_stretch(readout_slots / self.time.slot_rate_hz)
+        packet_slots = self.time.packet_slots
+
+        def packets(slots: FloatArray) -> float:
+            phase = tracking.BurstPhase(view.acquisition.repeats)
+            for slot, (inside, copies) in zip(slots, self.first_copies, strict=True):
+                phase.update(round((slot - inside) / packet_slots), copies)
+            return phase.log_evidence
+
+        return self.time.time_stamp_stretch(readout_slots / self.time.slot_rate_hz, packets)
 
     def headerless(self, closed: Sequence[confidence.BurstInView], n_columns: int) -> BoolArray:
         """Add closed bursts; returns (C,) the columns that have shown no headers."""

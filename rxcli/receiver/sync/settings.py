@@ -40,9 +40,14 @@ class SyncSettings(msgspec.Struct, frozen=True):
     max_jump_slots: float = 2.0
     #: Weight of a new measurement in the running mean of the frame period.
     period_share: float = 0.2
-    #: Clocks from which the stretch of time stamps is estimated, and its candidates (slow motion), likeliest first.
+    #: Clocks from which the stretch of time stamps is estimated, the largest one, and log-odds of any before them.
     n_judged_clocks: int = 5
-    stretches: tuple[int, ...] = (2, 4, 8, 16, 32, 5, 10, 20, 3, 6)
+    max_stretch: int = 40
+    slow_log_odds: float = -3.0
+    #: Log-odds by which one stretch must lead.
+    sure_stretch: float = 4.6
+    #: Deviations, of a mean rate, at which a stretch is no longer considered.
+    rate_limits: float = 4.0
     #: Tolerances from frame to frame: relative rate error, slots, error of time stamps in seconds; and the largest
     #: deviation of the clocks from a line, slots.
     rate_share: float = 0.004

@@ -5,7 +5,7 @@ counts slots from the clip's first clock, which numbers every copy of a packet. 
 a burst, which numbers every burst, including those in the gaps between frames.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,6 +23,8 @@ class LinkTime:
     slot_rate_hz: float
     #: Factor by which time stamps are longer than real time, as in slow motion.
     stretch: float = 1.0
+    #: Log-odds of that factor against others.
+    stretch_log_odds: float = float("inf")
     #: The first clocks: frame number, time stamp, slot of sensor row 0.
     _first_clocks: list[tuple[int, float, float]] = field(default_factory=list)
     #: The last clock: frame number, time, slot of sensor row 0.
@@ -37,11 +39,11 @@ class LinkTime:
 
         Args:
             frame: number of a frame.
-            time_s: its time.
+            time_s: its time stamp.
             slot: slot of its sensor row 0, from the start of any packet.
             period: slots from frame to frame.
         """
-        self._last = (frame, time_s, slot % self.packet_slots)
+        self._last = (frame, time_s / self.stretch, slot % self.packet_slots)
         self._period = period
         self._frame_s = period / self.slot_rate_hz
 
@@ -94,13 +96,15 @@ class LinkTime:
         """Whether enough clocks are known to judge the time stamps."""
         return len(self._first_clocks) >= SETTINGS.n_judged_clocks
 
-    def time_stamp_stretch(self, min_frame_s: float) -> float | None:
-        """Estimate by how much time stamps are stretched; None if no factor explains them.
+    def time_stamp_stretch(self, min_frame_s: float, packets: Callable[[FloatArray], float]) -> float | None:
+        """Estimate by how much time stamps are stretched; None if no factor explains them, or several above 1 do.
 
-        Headers show the link's clock up to whole packets. Uneven time stamps are not judged.
+        Headers show the link's clock up to whole packets, and equal packets show how many of them passed.
+        Uneven time stamps are not judged.
 
         Args:
             min_frame_s: shortest possible time between two frames.
+            packets: log-evidence of the frames' packets, by the slot of sensor row 0 of each.
         """
         frames, stamps, slots = np.array(self._first_clocks).T
         if len(frames) < 3 or np.ptp(frames) == 0:
@@ -110,12 +114,18 @@ class LinkTime:
         if slots_off > SETTINGS.uneven_slots or stamps_off > SETTINGS.uneven_s or stamp_s <= 0:
             return self.stretch
         uneven = 2 * stamps_off / np.ptp(frames) * self.slot_rate_hz + SETTINGS.rate_slots
-        for stretch in (1, *SETTINGS.stretches):
+        scored = []
+        for stretch in range(1, SETTINGS.max_stretch + 1):
             expected = stamp_s / stretch * self.slot_rate_hz
-            off = abs((period - expected + self.packet_slots / 2) % self.packet_slots - self.packet_slots / 2)
-            if off <= uneven / stretch + SETTINGS.rate_share * expected and stamp_s / stretch > min_frame_s:
-                return float(stretch)
-        return None
+            passed = self.packet_slots * round((period - expected) / self.packet_slots)
+            off, limit = abs(period - passed - expected), uneven / stretch + SETTINGS.rate_share * expected
+            if off <= limit and stamp_s / stretch > min_frame_s:
+                score = -SETTINGS.rate_limits * off / limit - np.log(limit) + SETTINGS.slow_log_odds * (stretch > 1)
+                scored.append((score + packets(slots - passed * (frames - frames[0])), float(stretch)))
+        rival, best = sorted([(-np.inf, 0.0), (-np.inf, 0.0), *scored])[-2:]
+        self.stretch_log_odds = best[0] - rival[0] if scored else np.inf
+        is_slow = best[1] != 1
+        return None if not scored or (is_slow and self.stretch_log_odds < SETTINGS.sure_stretch) else best[1]
 
     def clock_at(
         self, frame: int, time_s: float, like: Clock, n_slots: int, top_row: float, later_slots: float = 0.0
@@ -187,6 +197,13 @@ class BurstPhase:
         # Log prior: every phase of a number of copies is equally likely.
         self._score = -np.log(self._hypotheses[:, 0])
         self._copies: dict[int, FloatArray] = {}
+        #: Half the log-likelihood ratios of all pairs that were compared being equal.
+        self._half = 0.0
+
+    @property
+    def log_evidence(self) -> float:
+        """Log-likelihood of the bursts against packets that are all different."""
+        return float(np.logaddexp.reduce(self._score)) + self._half
 
     @property
     def settled(self) -> bool:
@@ -232,3 +249,4 @@ class BurstPhase:
         repeats, phases = self._hypotheses.T
         same = (copy_a + phases) // repeats == (copy_b + phases) // repeats
         self._score += np.where(same, llr / 2, -llr / 2)
+        self._half += llr / 2
