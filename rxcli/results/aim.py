@@ -24,8 +24,11 @@ _NEARER = f"{_CLOSER[:-1]}, and hold the camera level with it."
 _TURN = "Turn the camera, until its long side lies along the screen's."
 #: For those who aim: reason and next step, instead of those of photos.
 _AIMING: dict[Reason | None, tuple[str, str]] = {
-    **dict.fromkeys(("portrait", "on_its_side"), ("The screen lies on its side in the picture.", _TURN)),
-    **dict.fromkeys(("no_columns", "lit"), ("No screen that sends is in view.", _NEARER)),
+    **dict.fromkeys(
+        ("portrait", "on_its_side", "stripes_down"), ("The screen lies on its side in the picture.", _TURN)
+    ),
+    **dict.fromkeys(("no_columns", "no_columns_dark", "lit"), ("No screen that sends is in view.", _NEARER)),
+    "no_columns_striped": ("Stripes show, but no columns of a screen.", f"Expose shorter. {_NEARER}"),
     "part_striped": ("Only a part of the picture shows stripes.", _CLOSER),
 }
 _WORDS = {"no_screen": "no screen", "no_signal": "no signal", "unreadable": "no picture"}

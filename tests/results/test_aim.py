@@ -10,6 +10,7 @@ from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.options import receiver_options
 from rxcli.receiver.receive import receive_frame
 from rxcli.results.aim import Aim, brightness_of
+from rxcli.results.reasons import explained
 from rxcli.types import Frame
 
 MAX_HINTS, MAX_STEPS = 3, 12
@@ -46,7 +47,7 @@ def test_three_hints_lead_to_a_lock(start: str) -> None:
     options = receiver_options()
     for step in range(MAX_STEPS):
         frame = Frame(prepare(scene, step).frame().pixels, "camera", index=0)
-        result = receive_frame(frame, options)
+        result = explained(receive_frame(frame, options))
         for moment in (0.0, 0.5):  # a person who reads holds still
             state = aim.update(result, step + moment, frame.height, brightness_of(frame))
         if state.locked:
