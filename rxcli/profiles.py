@@ -70,12 +70,12 @@ class ScreenProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
     columns: Annotated[int, Meta(ge=1, le=200)]
     slot_rate_hz: Annotated[float, Meta(ge=500, le=1e6)]
     payload_symbols: Annotated[int, Meta(ge=1, le=64)]
-    repeats: Annotated[int, Meta(ge=1, le=100)] = 3
+    repeats: Annotated[int, Meta(ge=1, le=32)] = 3
     width_mm: Annotated[float, Meta(ge=10, le=1e4)] = 309.4
     height_mm: Annotated[float, Meta(ge=10, le=1e4)] = 173.95
-    width_px: Annotated[int, Meta(ge=1, le=16384)] = 1366
-    height_px: Annotated[int, Meta(ge=1, le=16384)] = 768
-    segment_rows: Annotated[int, Meta(ge=1, le=200)] = 8
+    width_px: Annotated[int, Meta(ge=1, le=4096)] = 1366
+    height_px: Annotated[int, Meta(ge=1, le=4096)] = 768
+    segment_rows: Annotated[int, Meta(ge=1, le=32)] = 8
     #: Standard deviation of the Gaussian light profile of a segment, segment pitches.
     light_spread: Annotated[float, Meta(ge=0, le=10)] = 0.45
     #: Not among the screens that are tried if none is named: the start of a long packet looks like a short one.
