@@ -28,7 +28,7 @@ _AIMING: dict[Reason | None, tuple[str, str]] = {
         ("portrait", "on_its_side", "stripes_down"), ("The screen lies on its side in the picture.", _TURN)
     ),
     **dict.fromkeys(("no_columns", "no_columns_dark", "lit"), ("No screen that sends is in view.", _NEARER)),
-    "no_columns_striped": ("Stripes show, but no columns of a screen.", f"Expose shorter. {_NEARER}"),
+    "no_columns_striped": ("Stripes show, but no columns of a screen.", _NEARER),
     "part_striped": ("Only a part of the picture shows stripes.", _CLOSER),
 }
 _WORDS = {"no_screen": "no screen", "no_signal": "no signal", "unreadable": "no picture"}
