@@ -20,12 +20,13 @@ _SUBWINDOWS, _TILES, _TILE_SD = 4, 4, 0.5
 #: Distance of the pairs of strips that show borders best, columns.
 _PAIR_DISTANCE = 0.72
 #: Borders per picture width across and down.
-_ACROSS, _DOWN = np.arange(5.0, 64.0), np.arange(-60.0, 61.0)
+_ACROSS, _DOWN = np.arange(5.0, 63.0, 2.0), np.arange(-60.0, 61.0, 2.0)
 #: Columns that are tried, and steps and largest values of turn and perspective: 50 degrees of roll, and 45 of yaw.
-_PITCHES = np.geomspace(9.0, 40.0, 26)
-_TURNS, _PERSPECTIVES, _MAX_PERSPECTIVE = np.linspace(-1.2, 1.2, 25), np.linspace(-1.4, 1.4, 15), 1.41
-#: Turn and perspective from which a course is none that upright strips show; log-likelihood that noise does not reach.
-_MIN_TURN, _MIN_PERSPECTIVE, _MIN_SCORE = 0.12, 0.3, 27.0
+_PITCHES = np.geomspace(9.0, 40.0, 20)
+_TURNS, _PERSPECTIVES, _MAX_PERSPECTIVE = np.linspace(-1.2, 1.2, 17), np.linspace(-1.4, 1.4, 11), 1.41
+#: Turn and perspective up to which upright strips show a course; log-likelihood that noise does not reach, and lead
+#: over upright courses.
+_UPRIGHT_TURN, _UPRIGHT_PERSPECTIVE, _MIN_SCORE, _LEAD = 0.16, 0.3, 27.0, 0.5
 
 
 def tilted_course(strips: PictureStrips) -> Course | None:
@@ -45,9 +46,10 @@ def tilted_course(strips: PictureStrips) -> Course | None:
         down = pitch * (turn + (turn * g - h) * x) / below
         score += spectrum[_nearest(across, _ACROSS), _nearest(down, _DOWN)]
     best = np.unravel_index(int(score.argmax()), score.shape)
-    course = Course(*(float(np.broadcast_to(values, score.shape)[best]) for values in (turn, g, h)))
-    is_upright = abs(course.turn) < _MIN_TURN and np.hypot(course.g, course.h) < _MIN_PERSPECTIVE
-    return None if is_upright or score[best] < _MIN_SCORE else course
+    is_upright = (np.abs(turn) < _UPRIGHT_TURN) & (np.hypot(g, h) < _UPRIGHT_PERSPECTIVE)
+    if score[best] < max(_MIN_SCORE, float(score[:, is_upright].max()) + _LEAD):
+        return None
+    return Course(*(float(np.broadcast_to(values, score.shape)[best]) for values in (turn, g, h)))
 
 
 def _nearest(values: FloatArray, places: FloatArray) -> NDArray[np.intp]:
