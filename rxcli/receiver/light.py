@@ -223,7 +223,7 @@ class Crosstalk:
     shares: FloatArray
 
     @staticmethod
-    def of(n_strips: int, light_spread: float, tails: float = 0.0) -> Crosstalk:
+    def of(n_strips: int, light_spread: float, tails: float = 0.0, offset: float = 0.0) -> Crosstalk:
         """Crosstalk of a Gaussian light profile with a standard deviation of `light_spread` pitches.
 
         The shares of a strip add up to 1, because the picture contains any common factor.
@@ -232,11 +232,13 @@ class Crosstalk:
             n_strips: strips of a column.
             light_spread: standard deviation, column pitches.
             tails: weight of shares of a profile twice as wide, as diffusers have tails.
+            offset: columns by which the strips lie to the right of their places.
         """
         if tails:
-            near, wide = (Crosstalk.of(n_strips, width).shares for width in (light_spread, 2 * light_spread))
+            widths = (light_spread, 2 * light_spread)
+            near, wide = (Crosstalk.of(n_strips, width, offset=offset).shares for width in widths)
             return Crosstalk(near + tails * (wide - near))
-        across = (np.arange(n_strips * _FINE) + 0.5) / (n_strips * _FINE) - 0.5
+        across = (np.arange(n_strips * _FINE) + 0.5) / (n_strips * _FINE) - 0.5 + offset
         distance = across[:, None] - np.arange(-1, 2)
         exponent = (-(distance**2) / (2 * max(light_spread, _MIN_WIDTH) ** 2)).reshape(n_strips, -1, 3)
         # A strip receives the mean over its width: a strip of a whole column has twice the crosstalk of its centre.

@@ -210,31 +210,41 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
 
 
 def detect_jointly(
-    acquisition: Acquisition, model: channel.ObservationModel, w_log_prob: FloatArray, lit: Float32Array | None
+    acquisition: Acquisition,
+    model: channel.ObservationModel,
+    w_log_prob: FloatArray,
+    lit: Float32Array | None,
+    columns: NDArray[np.int64] | None = None,
 ) -> tuple[BurstPosteriors, Float32Array]:
-    """Detect slots and picture of all columns, the copies as the clock assigns them.
+    """Detect slots and picture of some columns or all, the copies as the clock assigns them.
 
     Args:
         acquisition: the clock, and profiles with a level where the picture is known.
         model: of samples on the coarse grid.
         w_log_prob: (C, 9) log probability of the columns' weights.
         lit: (C, N) probability that each slot is lit, for the light of neighbours; None: unknown.
+        columns: numbers of the columns to detect; None: all.
 
     Returns:
-        The posteriors, and (C, N) squared contrast over variance.
+        The posteriors of these columns, and (C, N) squared contrast over variance of all.
     """
-    samples, bursts = _joint_samples(acquisition, model, w_log_prob, lit)
+    samples, bursts = _joint_samples(acquisition, model, w_log_prob, lit, columns)
     found = survivors.detect(bursts, QUICK_SURVIVORS if lit is None else survivor_settings)
     return found, _joint_snr(model.over_black(samples), samples, model, acquisition.clock)
 
 
 def _joint_samples(
-    acquisition: Acquisition, model: channel.ObservationModel, w_log_prob: FloatArray, lit: Float32Array | None
+    acquisition: Acquisition,
+    model: channel.ObservationModel,
+    w_log_prob: FloatArray,
+    lit: Float32Array | None,
+    columns: NDArray[np.int64] | None = None,
 ) -> tuple[SlotSamples, BurstSamples]:
-    clock, columns = acquisition.clock, np.arange(len(acquisition.profiles.light))
+    clock = acquisition.clock
+    columns = np.arange(len(acquisition.profiles.light)) if columns is None else columns
     samples = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
     bursts = ratios.burst_samples(samples, clock, model, columns, lit)
-    return samples, _with_weights(bursts, w_log_prob, are_open=True)
+    return samples, _with_weights(bursts, w_log_prob[columns], are_open=True)
 
 
 def _with_weights(

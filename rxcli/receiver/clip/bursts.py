@@ -11,7 +11,7 @@ import numpy as np
 from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver import channel
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.clip.views import View, decides_jointly
+from rxcli.receiver.clip.views import View
 from rxcli.receiver.decode import assemble, confidence, detect
 from rxcli.receiver.frame.settings import SETTINGS as pass_settings
 from rxcli.receiver.light import slot_llr
@@ -75,7 +75,7 @@ class Burst:
             margin = detect.slot_margin(self.metrics[None], self.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
             undenoised, joint = (
                 np.zeros(margin.shape[1], bool),
-                np.full(margin.shape[1], decides_jointly(view.acquisition.clock)),
+                np.full(margin.shape[1], view.joint is not None),
             )
             n_strips = view.acquisition.binned.light.shape[1]
             features = confidence.confidence_features(self.posteriors, margin, undenoised, n_strips, joint)[0]
@@ -98,7 +98,8 @@ def bursts_of(view: View) -> list[Burst]:
         copies, n_observed = view.first_copy + np.flatnonzero(which & shows_payload), view.shown[which].sum(axis=0)
         evidence = metrics[index]
         if joint is not None:
-            evidence = channel.metrics_of(llr_of(joint.posteriors.lit[index]) * (n_observed > 0), 1)
+            llr = llr_of(joint.posteriors.lit[index]) * (n_observed > 0)
+            evidence = channel.metrics_of(llr, int(metrics.shape[-1]).bit_length() - 2)
         bursts.append(Burst(number, evidence, n_observed, (view.context.frame.index,), copies, view.tracked))
     return bursts
 

@@ -148,7 +148,8 @@ class ClipCamera:
         """The same of a screen that was lost: where it was, or anywhere if that shows more packets.
 
         Packets of a long exposure show on many outlines, so that it is taken to be where it was; and the border of what
-        covers a part of a screen looks like the side of one that reaches out of the picture.
+        covers a part of a screen looks like the side of one that reaches out of the picture. If both are the same
+        columns, all frames so far know better where they are.
 
         Args:
             cache: the frame.
@@ -164,7 +165,8 @@ class ClipCamera:
         here = there.evidence if isinstance(there, Located) else 0.0
         if isinstance(anywhere, Located) and not anywhere.is_long:
             has_left = _width_in_view(anywhere.outline.corners, cache.frame) < _width_in_view(corners, cache.frame)
-            if anywhere.evidence > (search_settings.borderless_gain if has_left else 1.0) * here:
+            is_same = np.abs(anywhere.outline.corners - corners)[:, 0].max() < _column_px(anywhere) / 2
+            if anywhere.evidence > (search_settings.borderless_gain if has_left or is_same else 1.0) * here:
                 return anywhere
         return there
 
@@ -220,6 +222,10 @@ class ClipCamera:
 
 def _framing_of(found: Found) -> Framing:
     return framing_of(found.best.acquisition, found.best.reception, found.screens)
+
+
+def _column_px(located: Located) -> float:
+    return float(np.ptp(located.outline.corners[:, 0])) / located.context.screens[0].columns
 
 
 def _width_in_view(corners: FloatArray, frame: Frame) -> float:

@@ -60,6 +60,9 @@ class Known:
     outline: Outline | None = None
     #: The last frame.
     frame: Frame | None = None
+    #: Log-odds that the picture moves on the screen, and whether it was another one before.
+    film_log_odds: float = SETTINGS.film_log_odds
+    has_changed: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,6 +196,9 @@ def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | 
         waiting.update(skipped={"tracking": 1})
         state = replace(state, known=replace(state.known, corners=state.scene.corners))
     else:
+        if isinstance(state, Tracking):
+            log_odds = state.scene.film_log_odds
+            state = replace(state, known=replace(state.known, film_log_odds=log_odds, has_changed=True))
         state, view, report = _receive_anew(state.known, cache, located)
         waiting.update(denoiser=report)
     if isinstance(view, Failure):
@@ -267,9 +273,11 @@ def _receive_anew(
     options, acquisition, report = camera.options, acquired.acquisition, None
     tracks, denoised = _can_track(acquired, options), frozenset[int]()
     is_joint = decides_jointly(acquired.initial.clock)
+    adds_up = not is_joint and not known.has_changed
     with timer("detect"):
-        reception = decode(acquisition, options.skip, acquired.initial, adds_up=not is_joint)
-    if not tracks or options.cae == "always":  # Else further frames show the picture.
+        reception = decode(acquisition, options.skip, acquired.initial, adds_up=adds_up)
+    # Else further frames show the picture.
+    if not tracks or known.has_changed or options.cae == "always":
         with timer("denoise"):
             reception, denoised, report = apply_autoencoder(acquisition, reception, options)
     # Of long exposures packets were compared with arbitrary slots already.
@@ -290,13 +298,22 @@ def _receive_anew(
         reception.snr,
         denoised,
         framing=acquired.framing,
-        joint=JointSlots(reception.clock.burst, reception.posteriors) if is_joint else None,
+        joint=None if adds_up else JointSlots(reception.clock.burst, reception.posteriors),
     )
     if not tracks:
         return Lost(known), view, report
     with timer("sampling"):
         place = replace(acquired.context, sampled_corners=located.context.sampled_corners)
-        scene = TrackedScreen(place, acquisition, reception.model, options.corners is not None, located.dark_ends)
+        scene = TrackedScreen(
+            place,
+            acquisition,
+            reception.model,
+            reception.posteriors.w_log_prob,
+            known.film_log_odds,
+            known.has_changed,
+            options.corners is not None,
+            located.dark_ends,
+        )
         view.light, view.pose = scene.strips(frame), scene.pose
     scene.update(view, lambda: reception.clock.on_grid(reception.posteriors.lit))
     return Tracking(known, scene), view, report

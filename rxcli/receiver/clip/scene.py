@@ -10,8 +10,9 @@ import numpy as np
 
 from rxcli.numerics import TINY
 from rxcli.receiver import channel, plane
-from rxcli.receiver.channel import ObservationModel, SlotLikelihoods, known_picture
-from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
+from rxcli.receiver.channel import ObservationModel, known_picture
+from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture, Update
+from rxcli.receiver.clip.place import ScreenPlace
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.timeline import Timeline
 from rxcli.receiver.clip.views import JointSlots, Pose, View, decides_jointly
@@ -23,9 +24,21 @@ from rxcli.receiver.light import MIN_VARIANCE, Crosstalk, Exposure, NoiseModel, 
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
-from rxcli.receiver.still import detect_jointly, in_bursts, lateness, llr_of
+from rxcli.receiver.still import (
+    decode,
+    detect_jointly,
+    detected,
+    detected_on,
+    in_bursts,
+    initial_pass,
+    lateness,
+    llr_of,
+)
 from rxcli.receiver.sync import tracking
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray, Outlines
+
+#: What the photograph of a film's frame need not do: columns that are certain or dark.
+_SKIPPED_OF_FILM = frozenset({"certain_columns", "dark_columns"})
 
 
 class TrackedScreen:
@@ -35,6 +48,9 @@ class TrackedScreen:
         context: the frame that it begins with.
         acquisition: of that frame.
         model: light model of that frame.
+        w_log_prob: (C, 9) log probability of the columns' weights in that frame.
+        film_log_odds: log-odds that the picture moves on the screen.
+        has_changed: whether another picture was shown before.
         named: whether the user gave the corners.
         dark_ends: rows at the top and at the bottom of the outline that may not be on the screen; None: unknown.
     """
@@ -44,6 +60,9 @@ class TrackedScreen:
         context: FrameContext,
         acquisition: Acquisition,
         model: ObservationModel,
+        w_log_prob: FloatArray,
+        film_log_odds: float,
+        has_changed: bool,
         named: bool,
         dark_ends: tuple[int, int] | None,
     ) -> None:
@@ -61,15 +80,19 @@ class TrackedScreen:
         noise_floor = max(acquisition.profiles.noise_floor, MIN_VARIANCE * strips.pixels)
         #: Of a pixel.
         self._noise = NoiseModel(noise_floor, acquisition.profiles.noise_slope)
-        self._crosstalk = Crosstalk.of(self._n_strips, acquisition.screen.light_spread, model.tails[0])
-        #: Where the screen is; the picture is known on the rows where it was first.
-        self.pose = self._first_pose = Pose(corners, strips, strips)
+        self._tails, self._w_log_prob = model.tails[0], w_log_prob
+        self._crosstalk = self._crosstalk_at(0.0)
+        #: Where the screen is, and where the strips are read; the picture is known on the rows where it was first.
+        self._place = ScreenPlace.at(corners, acquisition.screen.columns, self._lens, film_log_odds)
+        self.pose = self._first_pose = Pose(corners, corners, strips, strips)
         #: The frame that was received last.
         self.last: View | None = None
         self._texture = ScreenTexture(frame, corners, self._lens)
         #: Searches in a row that found the screen where it was, and frames since the last one.
         self._n_rested = self._n_unlooked = 0
         self._n_updates = 0
+        #: Frames for which the picture is taken to change from one to the next, once it was seen to.
+        self._n_changed = SETTINGS.look_every if has_changed else 0
         #: (C,) mean light of the columns in the last frame, and its exposure relative to that of the picture.
         self._level, self._gain = np.maximum(self.strips(frame).mean(axis=(1, 2)), TINY), 1.0
         self._picture = self._new_picture()
@@ -77,7 +100,17 @@ class TrackedScreen:
     @property
     def corners(self) -> FloatArray:
         """(4, 2) where the screen was last."""
-        return self.pose.corners
+        return self._place.likelier.corners
+
+    @property
+    def film_log_odds(self) -> float:
+        """Log-odds that the picture moves on the screen."""
+        return self._place.log_odds
+
+    @property
+    def _changes(self) -> bool:
+        """Whether the picture changes from frame to frame."""
+        return self._place.is_film or self._n_changed > 0
 
     @property
     def rows(self) -> FloatArray:
@@ -102,44 +135,56 @@ class TrackedScreen:
         if self.last is None:
             return None
         self._n_unlooked += 1
+        self._n_changed = max(self._n_changed - 1, 0)
         rests = self._n_rested >= SETTINGS.still_looks
         if rests and self._n_unlooked < SETTINGS.look_every:
             view = self._view(cache, self.last, timeline, SETTINGS.rest_misfit)
             if view is not None:
                 return view
         with cache.timer("geometry"):
-            is_followed = self._follow(cache.frame)
-        return self._view(cache, self.last, timeline, SETTINGS.misfit) if is_followed else None
+            found = self._follow(cache.frame)
+        if found is None:
+            return None
+        was_film, excess = self._place.is_film, self._picture.excess.copy()
+        view = self._view(cache, self.last, timeline, SETTINGS.misfit)
+        if self._place.is_film != was_film:  # The picture was taken to be elsewhere on the screen.
+            self._picture.excess[:] = excess
+            self._move(cache.frame, found)
+            view = self._view(cache, self.last, timeline, SETTINGS.misfit)
+        return view
 
     def _view(self, cache: FrameCache, last: View, timeline: Timeline, max_misfit: float) -> View | None:
         """Receive a frame with the screen at its current pose."""
         pose, frame, timer = self.pose, cache.frame, cache.timer
         with timer("sampling"):
             light, picture = self._scaled(self.strips(frame)), self._placed(pose)
-            columns = picture.solve(light)
+            own_clock = last.acquisition.clock
+            likely = picture.adapted(light, None, own_clock.rows_per_slot) if self._changes else picture
+            columns = likely.solve(light)
         with timer("clock"):
-            clock = self._clock(frame, columns, last.acquisition.clock, timeline.time)
+            clock = self._clock(frame, columns, own_clock, timeline.time)
         if clock is None:
             return None
+        context = replace(last.context, cache=cache, sampled_corners=self.corners)
         if decides_jointly(clock):
-            bursts, observed = timeline.assigned(frame, clock), _Observed(pose.rows, light, columns)
-            return self._long_view(cache, observed, picture, clock, bursts, max_misfit)
+            bursts, observed = timeline.assigned(frame, clock), _Observed(context, pose, light, columns)
+            return self._long_view(cache, observed, likely, clock, bursts, max_misfit)
         with timer("detect"):
-            positions = known_picture.row_positions(pose.rows, clock)
-            lit = known_picture.first_decision(columns, positions, clock)
-            observed = _Observed(pose.rows, light, columns)
-            measured = self._measured(picture, observed, clock, lit, max_misfit)
+            bursts = timeline.assigned(frame, clock)
+            clock = clock.by_copy if bursts is None else replace(clock, burst=bursts)
+            measured = self._measured(picture, _Observed(context, pose, light, columns), clock, None, max_misfit)
             if measured is None:
                 return None
-            clock, likelihoods = measured
+            clock, metrics, snr = measured.clock, measured.metrics, measured.snr
+            self._measure_place(picture, light, measured.expected)
             shown = _shown(pose.map.inside, known_picture.row_positions(pose.rows, clock), clock)
         return View(
             replace(last.context, cache=cache, sampled_corners=self.corners),
             replace(last.acquisition, clock=clock),
             clock,
-            likelihoods.metrics,
+            metrics,
             shown,
-            likelihoods.snr,
+            snr,
             light=light,
             pose=pose,
             tracked=True,
@@ -159,11 +204,10 @@ class TrackedScreen:
         `clock` is the predicted one, and `bursts` are those of its copies once they are known.
         """
         assert self.last is not None
-        assert self.last.joint is not None
         pose = self.pose
         with cache.timer("detect"):
             acquisition = self._acquired(observed.light, pose, picture, clock)
-            model, weights = self._model(clock), self.last.joint.posteriors.w_log_prob
+            model, weights = self._model(clock), self._w_log_prob
             late = lateness(acquisition, model, weights, SETTINGS.long_step)
             clock = replace(clock, row0=clock.row0 - late * clock.rows_per_slot)
             single = replace(acquisition, clock=clock.by_copy)
@@ -172,7 +216,11 @@ class TrackedScreen:
             metrics = by_copy_metrics(lit)
             clock = in_bursts(acquisition, clock, metrics) if bursts is None else replace(clock, burst=bursts)
             found, _ = detect_jointly(replace(acquisition, clock=clock), model, weights, lit)
-            lit = clock.on_grid(found.lit)
+            if self._changes:  # A picture that is wrong in detail is worse than none.
+                free, _ = detect_jointly(self._acquired(observed.light, pose, None, clock), model, weights, lit)
+                better = np.flatnonzero(free.log_evidence > found.log_evidence)
+                found = found.with_columns(better, free.of_columns(better))
+            self._w_log_prob, lit = found.w_log_prob, clock.on_grid(found.lit)
             positions = known_picture.row_positions(pose.rows, clock)
             fit = known_picture.fit_response(observed.columns, lit, positions, clock.exposure_slots)
             n_slots = int(np.ceil(clock.exposure_slots))
@@ -180,6 +228,7 @@ class TrackedScreen:
             rows_per_slot, share = clock.rows_per_slot, SETTINGS.frame_share
             if picture.judge(observed.columns, expected, max_misfit, share, rows_per_slot) is None:
                 return None
+            self._measure_place(picture, observed.light, expected)
             shown = _shown(pose.map.inside, positions, clock)
         view = View(
             replace(self.last.context, cache=cache, sampled_corners=self.corners),
@@ -196,18 +245,57 @@ class TrackedScreen:
         return view
 
     def _measured(
-        self, picture: PlacedPicture, observed: _Observed, clock: Clock, lit: Float32Array, max_misfit: float
-    ) -> tuple[Clock, SlotLikelihoods] | None:
+        self, picture: PlacedPicture, observed: _Observed, clock: Clock, lit: Float32Array | None, max_misfit: float
+    ) -> _Measured | None:
         """Correct clock, response and noise of a frame by its decided slots `lit` (C, N); then likelihoods.
 
-        None where the light does not fit the decisions: another scene, or something in front of the screen.
+        Where the picture may have changed, each column counts by the known picture or by what the frame shows of it,
+        whichever has more information on the slots. None where the light does not fit the decisions: another scene, or
+        something in front of the screen.
         """
-        rows, columns, isi_memory = observed.rows, observed.columns, self._isi_memory
+        known = None
+        if not self._changes:
+            known = self._measured_by(picture, observed, clock, lit, max_misfit)
+            # A picture of few frames is not known well.
+            may_have_changed = lit is None and self._n_updates >= SETTINGS.first_frames
+            if known is None or not may_have_changed or (picture.excess < SETTINGS.changed_misfit).all():
+                return known
+        shown = picture.adapted(observed.light, None, clock.rows_per_slot)
+        adapted = self._measured_by(shown, observed, clock, lit, max_misfit, adapts=True)
+        if adapted is None:
+            return known
+        found, changed = adapted, np.ones(len(adapted.metrics), bool)
+        if known is not None:
+            changed = (picture.excess >= SETTINGS.changed_misfit) & (adapted.information > known.information)
+            found = known.with_columns(changed, adapted)
+            if changed.mean() > 0.5:
+                self._n_changed = SETTINGS.look_every
+        return replace(found, metrics=self._with_doubtful(observed, found.clock, found.metrics, changed))
+
+    def _measured_by(
+        self,
+        picture: PlacedPicture,
+        observed: _Observed,
+        clock: Clock,
+        lit: Float32Array | None,
+        max_misfit: float,
+        *,
+        adapts: bool = False,
+    ) -> _Measured | None:
+        """The same by one picture, which is adapted to the frame by its decided slots if it `adapts`."""
+        rows, light, isi_memory = observed.pose.rows, observed.light, self._isi_memory
         positions = known_picture.row_positions(rows, clock)
+        columns = picture.solve(light)
+        if lit is None:
+            lit = known_picture.first_decision(columns, positions, clock)
         fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
-        if fit.centre < SETTINGS.faded:
+        if adapts or fit.centre < SETTINGS.faded:
             expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit)
-            columns = picture.solve_again(observed.light, expected.light, clock.rows_per_slot)
+            if adapts:
+                picture = picture.adapted(light, expected.light, clock.rows_per_slot)
+            columns = picture.solve_again(light, expected.light, clock.rows_per_slot)
+            if adapts:
+                lit = known_picture.first_decision(columns, positions, clock)
             fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
         if abs(fit.late) > SETTINGS.late_slots:
             clock = replace(clock, row0=clock.row0 - fit.late * clock.rows_per_slot)
@@ -217,9 +305,45 @@ class TrackedScreen:
         judged = picture.judge(columns, expected.light, max_misfit, SETTINGS.frame_share, clock.rows_per_slot)
         if judged is None:
             return None
-        return clock, known_picture.slot_likelihoods(judged, expected, clock, isi_memory)
+        found = known_picture.slot_likelihoods(judged, expected, clock, isi_memory)
+        return _Measured(clock, found.metrics, found.snr, expected.light, judged.precision.sum(axis=1))
 
-    def _acquired(self, light: Float32Array, pose: Pose, picture: PlacedPicture, clock: Clock) -> Acquisition:
+    def _with_doubtful(self, observed: _Observed, clock: Clock, metrics: FloatArray, changed: BoolArray) -> FloatArray:
+        """Metrics, those of doubtful `changed` (C,) columns by two joint detections without a picture.
+
+        One sees the strips that were read, one those of a photograph. They err unlike, and share the noise: their mean
+        counts.
+        """
+        found = detected(metrics, clock)
+        doubts = found.log_prob.sum(axis=2).min(axis=0) < SETTINGS.doubtful_log_prob
+        doubtful = np.flatnonzero(doubts & changed)
+        if not doubtful.size:
+            return metrics
+        strips = self._acquired(observed.light, observed.pose, None, clock)
+        weights = np.maximum(found.w_log_prob, self._w_log_prob)
+        joint, _ = detect_jointly(strips, self._model(clock), weights, clock.on_grid(found.lit), doubtful)
+        profiles = observed.context.sample_columns(self._acquisition.screen.columns)
+        acquisition = replace(strips, profiles=profiles)
+        initial = initial_pass(acquisition)
+        initial = detected_on(initial, replace(initial.clock, burst=clock.burst))
+        photograph = decode(acquisition, _SKIPPED_OF_FILM, initial).posteriors.of_columns(doubtful)
+        of_each = replace(clock, delay_slots=clock.delay_slots[doubtful])
+        # The copies of a burst were added up already.
+        llr = (llr_of(joint.lit) + llr_of(photograph.lit)) / 2 / np.bincount(clock.burst)[:, None, None]
+        metrics[doubtful] = channel.metrics_of(of_each.on_grid(llr), self._isi_memory)
+        return metrics
+
+    def _measure_place(self, picture: PlacedPicture, light: Float32Array, expected: Float32Array) -> None:
+        """Correct the screen's place by the columns' light as `expected` from decided slots (C, R)."""
+        step, offset = 1 / 16 / self._n_strips, self.pose.offset
+        near, far = (self._crosstalk_at(offset + each).shares for each in (-step, step))
+        slope = ((far - near) / (2 * step)).astype(np.float32)
+        measured = picture.displacement(light, expected, slope)
+        if measured is not None:
+            off, covariance = measured
+            self._place = self._place.measured(self.pose.read, offset + off, covariance)
+
+    def _acquired(self, light: Float32Array, pose: Pose, picture: PlacedPicture | None, clock: Clock) -> Acquisition:
         """Light of the strips with the picture as far as it is known, on a clock."""
         profiles = replace(
             self._acquisition.profiles,
@@ -227,7 +351,7 @@ class TrackedScreen:
             inside=pose.map.inside,
             rows=pose.rows.astype(np.int64),
             count=np.full(light.shape[:2], pose.map.pixels, np.float32),
-            level=picture.picture * np.float32(0.5),
+            level=None if picture is None else picture.picture * np.float32(0.5),
         )
         return replace(self._acquisition, profiles=profiles, clock=clock)
 
@@ -267,36 +391,51 @@ class TrackedScreen:
 
     # -- where the screen is -------------------------------------------------------------------------------------------
 
-    def _follow(self, frame: Frame) -> bool:
-        """Find where the screen is in a frame, by the picture on it; False if it shows another picture."""
+    def _follow(self, frame: Frame) -> Registration | None:
+        """Find where the screen is in a frame, by the picture on it; None if it shows another picture."""
         self._n_unlooked = 0
         found = self._texture.find(frame)
-        if found.is_precise and not found.fits and not self._named:
-            return False
-        if (self._named and not found.is_precise) or _is_still(found.corners - self.corners, found.sd_px):
-            found = replace(found, corners=self.corners)
+        if not found.fits and (self._place.is_film or (found.is_precise and not self._named)):
+            return None
+        if (self._named and not found.is_precise) or _is_still(found.corners - self.pose.picture, found.sd_px):
+            found = replace(found, corners=self.pose.picture)
             self._n_rested += 1
         else:
+            self._place = self._place.after(self.pose.picture, found.corners, frame)
             self._move(frame, found)
             self._n_rested = 0
         self._texture.learn(frame, found)
-        return True
+        return found
 
     def _move(self, frame: Frame, found: Registration) -> None:
-        """Move the strips to where the screen was found."""
-        home, outlines = self._first_pose.map, self._outlines(frame, found.corners)
+        """Move the strips to the screen, near whole strips of the picture on it."""
+        home, at = self._first_pose.map, self._place.likelier
+        n_columns, n_strips = self._acquisition.screen.columns, self._n_strips
+        moved = float(self._place.off(found.corners, at).mean())
+        shift = round(moved * n_strips)
+        offset = moved - shift / n_strips
+        read = geometry.beside(at.corners, offset / n_columns, self._lens)
+        outlines = self._outlines(frame, read)
         strips = tracked.moved_map(home, replace(outlines, inside=_without_ends(outlines.inside, *self._end_rows)))
         picture_row = geometry.rows_elsewhere(
-            strips.rows, self._middles(found.corners), self._middles(self._first_pose.corners)
+            strips.rows, self._middles(found.corners, shift), self._middles(self._first_pose.picture, shift)
         )
-        self.pose = Pose(found.corners, strips, home, picture_row - np.float32(home.first_row))
+        row = picture_row - np.float32(home.first_row)
+        self.pose = Pose(read, found.corners, strips, home, row, offset, shift, self._crosstalk_at(offset))
 
     def _outlines(self, frame: Frame, corners: FloatArray) -> Outlines:
         n_columns = self._acquisition.screen.columns
         return geometry.column_outlines(corners, n_columns, self._n_strips, frame.width, frame.height, self._lens)
 
-    def _middles(self, corners: FloatArray) -> FloatArray:
-        return geometry.column_middles(corners, self._acquisition.screen.columns, self._lens)
+    def _middles(self, corners: FloatArray, shift: int) -> FloatArray:
+        """Rows down the middles of the columns that a picture at `corners` has under it, moved by some strips."""
+        n_columns = self._acquisition.screen.columns
+        under = geometry.beside(corners, -shift / (n_columns * self._n_strips), self._lens)
+        return geometry.column_middles(under, n_columns, self._lens)
+
+    def _crosstalk_at(self, offset: float) -> Crosstalk:
+        """Crosstalk of strips that lie `offset` columns to the right of their places."""
+        return Crosstalk.of(self._n_strips, self._acquisition.screen.light_spread, self._tails, offset)
 
     # -- the picture ---------------------------------------------------------------------------------------------------
 
@@ -312,22 +451,23 @@ class TrackedScreen:
 
     def _placed(self, pose: Pose) -> PlacedPicture:
         """The picture on the rows of a pose."""
-        return self._picture.placed(pose.map.inside, pose.picture_row)
+        return self._picture.placed(pose.map.inside, pose.picture_row, pose.shift, pose.crosstalk)
 
     def update(self, view: View, lit: Callable[[], Float32Array]) -> None:
-        """Set the frame that was received last; learn from the first frames, and from some later ones.
+        """Set the frame that was received last; learn from the first frames, some later ones, and all of a film.
 
         Args:
             view: the frame.
             lit: gives the probability (C, N) that each of its slots is lit.
         """
-        if self._n_updates < SETTINGS.first_updates or (self._n_updates + 1) % SETTINGS.first_updates == 0:
+        is_due = self._n_updates < SETTINGS.first_updates or (self._n_updates + 1) % SETTINGS.first_updates == 0
+        if is_due or self._changes:
             self.learn(view, lit())
         else:
             self._n_updates += 1
         self.last = view
 
-    def learn(self, view: View, lit: Float32Array, *, forget: bool = True) -> Float32Array | None:
+    def learn(self, view: View, lit: Float32Array, *, forget: bool = True) -> Update | None:
         """Take a frame into the picture; returns the update of the picture.
 
         See `known_picture.KnownPicture.learn` for `forget`.
@@ -341,9 +481,13 @@ class TrackedScreen:
         trust = np.maximum(1 - SETTINGS.doubt_weight * doubt, 0)
         if pose.picture_row is not None:
             frame_row = geometry.rows_elsewhere(
-                self._first_pose.rows, self._middles(self._first_pose.corners), self._middles(pose.corners)
+                self._first_pose.rows,
+                self._middles(self._first_pose.picture, pose.shift),
+                self._middles(pose.picture, pose.shift),
             ) - np.float32(pose.map.first_row)
-        observation = known_picture.Observation(view.light, slots, trust, pose.map.inside, frame_row)
+        observation = known_picture.Observation(
+            view.light, slots, trust, pose.map.inside, frame_row, pose.shift, pose.crosstalk
+        )
         return self._picture.learn(observation, forget=forget)
 
     def can_measure_again(self, view: View) -> bool:
@@ -365,12 +509,12 @@ class TrackedScreen:
             if needed and update is not None:
                 self._measure_again(view, update, lit)
 
-    def _measure_again(self, view: View, own: Float32Array, known: Float32Array) -> None:
+    def _measure_again(self, view: View, own: Update, known: Float32Array) -> None:
         """Measure a frame by the picture, less what the frame itself has shown of it."""
         assert view.light is not None
         assert view.pose is not None
         pose, clock = view.pose, view.clock
-        picture = self._picture.without(own).placed(pose.map.inside, pose.picture_row)
+        picture = self._picture.without(own).placed(pose.map.inside, pose.picture_row, pose.shift, pose.crosstalk)
         if view.joint is not None:
             acquisition = self._acquired(view.light, pose, picture, clock)
             known_better, _ = detect_jointly(acquisition, self._model(clock), view.joint.posteriors.w_log_prob, known)
@@ -379,21 +523,46 @@ class TrackedScreen:
         columns = picture.solve(view.light)
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:
             return
-        observed = _Observed(pose.rows, view.light, columns)
+        observed = _Observed(view.context, pose, view.light, columns)
         measured = self._measured(picture, observed, clock, known, SETTINGS.misfit)
         if measured is not None:
-            view.clock, likelihoods = measured
-            view.snr, view.metrics, view.tracked = likelihoods.snr, likelihoods.metrics, True
+            view.clock, view.snr, view.metrics, view.tracked = measured.clock, measured.snr, measured.metrics, True
 
 
 @dataclass(frozen=True, slots=True)
 class _Observed:
     """Light of a frame."""
 
-    #: (R,) sensor rows, (C, S, R) light of the strips there, and the columns' own light.
-    rows: FloatArray
+    #: The frame, and where it was read; (C, S, R) light of the strips there, and the columns' own light.
+    context: FrameContext
+    pose: Pose
     light: Float32Array
     columns: ColumnLight
+
+
+@dataclass(frozen=True, slots=True)
+class _Measured:
+    """Slots by the light of a frame."""
+
+    clock: Clock
+    #: (C, N + memory, patterns), and (C, 1) squared contrast over variance of a slot.
+    metrics: FloatArray
+    snr: Float32Array
+    #: (C, R) light of the columns by the decided slots; and (C,) information on the slots: its precision.
+    expected: Float32Array
+    information: Float32Array
+
+    def with_columns(self, which: BoolArray, given: _Measured) -> _Measured:
+        """The same with some columns as `given`."""
+        fields = {
+            name: np.where(
+                which[(slice(None), *[None] * (getattr(self, name).ndim - 1))],
+                getattr(given, name),
+                getattr(self, name),
+            )
+            for name in ("metrics", "snr", "expected", "information")
+        }
+        return replace(self, **fields)
 
 
 def by_copy_metrics(lit: Float32Array) -> FloatArray:

@@ -12,6 +12,23 @@ class ClipSettings(msgspec.Struct, frozen=True):
     wrong_slots: float = 0.08
     #: Maximum number of strips of a column: more do not improve a known picture, and take time.
     max_strips: int = 4
+    #: Log-odds before anything is seen that the picture moves on the screen, probabilities that it begins or
+    #: ends to do so in a frame, and limit of the log-odds.
+    film_log_odds: float = -3.0
+    film_begins: float = 0.003
+    film_ends: float = 0.03
+    max_log_odds: float = 20.0
+    #: Standard deviation of the columns that were found, and of what errors of the light model add where slots
+    #: show, in columns; share of the picture's motion that is uncertain.
+    place_sd: float = 0.05
+    columns_sd: float = 0.01
+    unsteady_share: float = 0.3
+    #: Ends of the screen: places along them, least rows by which hypotheses differ, light in units of white that counts
+    #: as none, and log-odds by which light at an end decides.
+    n_end_places: int = 40
+    min_end_rows: int = 2
+    min_end_light: float = 0.02
+    end_log_odds: float = 2.0
     #: Movement that is none: pixels, or standard deviations of what was found.
     still_px: float = 0.3
     still_sds: float = 2.5
@@ -30,6 +47,8 @@ class ClipSettings(msgspec.Struct, frozen=True):
     #: that is taken to rest: while it does 0.8 to 1.3 times, 2 pixels away 2 times and more.
     misfit: float = 40.0
     rest_misfit: float = 1.5
+    #: The same from which a column's picture may have changed: in a hand it is 1.6 on average.
+    changed_misfit: float = 3.0
     #: Contrast of headers, against full, below which nothing is known any more, and contrast of a frame below which
     #: compression has taken much of it.
     min_header: float = 0.3

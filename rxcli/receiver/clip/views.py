@@ -8,6 +8,7 @@ from typing import Any
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.context import FrameContext
+from rxcli.receiver.light import Crosstalk
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.search.framing import Framing
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, FrameResult, IntArray
@@ -15,15 +16,21 @@ from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, FrameR
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """Where a screen is in a frame."""
+    """Where the light of a screen is read in a frame, and where its picture is."""
 
-    #: (4, 2) pixels, the viewer's top-left first.
-    corners: FloatArray
+    #: (4, 2) pixels each, the viewer's top-left first.
+    read: FloatArray
+    picture: FloatArray
     map: tracked.StripMap
     #: The strips on whose rows the picture is known.
     home: tracked.StripMap
     #: (C, R) row of the known picture at each row of the frame; None where the screen is where it was first.
     picture_row: Float32Array | None = None
+    #: Columns by which the strips lie to the right of their places, whole strips by which the picture has moved to the
+    #: right on the screen, and crosstalk of the strips there.
+    offset: float = 0.0
+    shift: int = 0
+    crosstalk: Crosstalk | None = None
 
     @property
     def rows(self) -> FloatArray:

@@ -31,6 +31,9 @@ INVERSE_STEPS, _MIN_STEP = 20, 1e-8
 #: Rows over which edges are interpolated linearly: straight to a thousandth of a pixel.
 _KNOT_ROWS = 32
 
+#: u and v of a screen's corners.
+_SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+
 
 def viewer_order(corners: FloatArray, orientation: int) -> FloatArray:
     """Corners of the stored picture (top-left first, clockwise) in the viewer's order.
@@ -128,6 +131,29 @@ def screen_to_picture(points: FloatArray, corners: FloatArray, lens: Lens | None
     flat = undistort(corners, bending(lens))
     projected = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ homography(flat).T
     return distort(projected[..., :2] / projected[..., 2:], bending(lens))
+
+
+def beside(corners: FloatArray, shares: FloatArray | float, lens: Lens | None) -> FloatArray:
+    """(4, 2) corners whose left and right are moved to the right in the plane of the screen, by shares of its width."""
+    moved = _SQUARE.copy()
+    moved[:, 0] += np.broadcast_to(shares, 2)[[0, 1, 1, 0]]
+    return screen_to_picture(moved, corners, lens)
+
+
+def sides_off(corners: FloatArray, moved: FloatArray, lens: Lens | None) -> FloatArray:
+    """(2,) shares of a screen's width by which left and right of corners `moved` lie to the right of its `corners`."""
+    flat = undistort(moved, bending(lens))
+    u, _, scale = np.linalg.inv(homography(undistort(corners, bending(lens)))) @ np.c_[flat, np.ones(4)].T
+    off = u / scale - _SQUARE[:, 0]
+    return np.array([off[[0, 3]].mean(), off[[1, 2]].mean()])
+
+
+def carried(corners: FloatArray, before: FloatArray, after: FloatArray, lens: Lens | None) -> FloatArray:
+    """(4, 2) corners moved as the plane whose corners moved from `before` to `after`, (4, 2) each."""
+    lens = bending(lens)
+    motion = homography(undistort(after, lens)) @ np.linalg.inv(homography(undistort(before, lens)))
+    x, y, scale = motion @ np.c_[undistort(corners, lens), np.ones(4)].T
+    return distort(np.stack([x / scale, y / scale], axis=-1), lens)
 
 
 def column_outlines(

@@ -12,7 +12,7 @@ compression, `header` measures the contrast of headers, and `metrics` computes s
 from rxcli.receiver.channel.known_picture.exposure import Response, expected_light, row_positions
 from rxcli.receiver.channel.known_picture.header import first_decision, header_contrast
 from rxcli.receiver.channel.known_picture.metrics import slot_likelihoods
-from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Observation, PlacedPicture
+from rxcli.receiver.channel.known_picture.picture import ColumnLight, KnownPicture, Observation, PlacedPicture, Update
 from rxcli.receiver.channel.known_picture.response import fit_response
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "Observation",
     "PlacedPicture",
     "Response",
+    "Update",
     "expected_light",
     "first_decision",
     "fit_response",

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from rxcli.numerics import box_sums
+from rxcli.numerics import TINY, box_sums
 from rxcli.receiver.channel.known_picture.equations import RowEquations
 from rxcli.receiver.channel.known_picture.settings import SETTINGS
 from rxcli.receiver.light import Crosstalk, NoiseModel
-from rxcli.types import BoolArray, Float32Array
+from rxcli.types import BoolArray, Float32Array, FloatArray
 
 #: Information of light that almost nothing shows.
 _FAINT = np.float32(1e-3)
@@ -41,6 +41,18 @@ class Observation:
     inside: BoolArray
     #: (C, P) frame row of each picture row; None if unchanged since the first frame.
     frame_row: Float32Array | None = None
+    #: Strips by which the picture has moved to the right on the screen, and crosstalk; None: as at first.
+    shift: int = 0
+    crosstalk: Crosstalk | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """What a frame shows of the picture."""
+
+    #: (4, C, S, R), see `KnownPicture`, and the strips by which the picture had moved.
+    sums: Float32Array
+    shift: int
 
 
 class KnownPicture:
@@ -68,46 +80,67 @@ class KnownPicture:
         self._exposure_slots = max(exposure_slots, 1.0)
         #: (4, C, S, R) sums over the frames, see `_update_of`.
         self._sums: Float32Array = np.zeros((4, *shape), np.float32)
+        #: Strips by which the picture has moved to the right on the screen.
+        self._shift = 0
         #: Picture and variance of its light, and the picture where it was placed last; None after a change.
         self._made: tuple[Float32Array, Float32Array] | None = None
         self._placed: tuple[BoolArray, PlacedPicture] | None = None
         #: (C,) variance of the columns' light over what was predicted; all placed pictures share it.
-        self._excess = np.ones(shape[0], np.float32)
+        self.excess, self.adapted_excess = np.ones((2, shape[0]), np.float32)
 
-    def placed(self, inside: BoolArray, picture_row: Float32Array | None = None) -> PlacedPicture:
+    def placed(
+        self,
+        inside: BoolArray,
+        picture_row: Float32Array | None = None,
+        shift: int = 0,
+        crosstalk: Crosstalk | None = None,
+    ) -> PlacedPicture:
         """The picture on the rows of a frame.
 
         Args:
             inside: (C, S, R) the strip is on the screen.
             picture_row: (C, R) row of the picture at each row of the frame; None if they are the same.
+            shift: strips by which the picture has moved to the right on the screen.
+            crosstalk: of the strips there; None: as at first.
         """
         if self._placed is None or self._placed[0] is not inside:
+            self._move(shift)
             picture, variance = self.picture()
             if picture_row is not None:
                 picture, variance = (_resampled(values, picture_row, beyond=False) for values in (picture, variance))
-            on_frame = PlacedPicture(picture, variance, inside, self._crosstalk, self._black_level, self._excess)
+            shares = self._crosstalk if crosstalk is None else crosstalk.shares.astype(np.float32)
+            excess = self.excess, self.adapted_excess
+            on_frame = PlacedPicture(picture, variance, inside, shares, self._black_level, *excess)
             self._placed = inside, on_frame
         return self._placed[1]
 
-    def learn(self, observation: Observation, *, forget: bool = True) -> Float32Array:
+    def _move(self, shift: int) -> None:
+        """Move the picture on the screen; what comes in from its sides is unknown."""
+        if shift != self._shift:
+            self._sums, self._shift = _rolled(self._sums, shift - self._shift), shift
+            self._made = self._placed = None
+
+    def learn(self, observation: Observation, *, forget: bool = True) -> Update:
         """Update the picture by a frame with known slots, and return the update.
 
         With `forget`, earlier frames lose some weight.
         """
+        self._move(observation.shift)
         update = self._update_of(observation)
         self._sums = self._sums * np.float32(SETTINGS.memory_share if forget else 1.0) + update
         self._made = self._placed = None
-        return update
+        return Update(update, observation.shift)
 
-    def without(self, update: Float32Array) -> KnownPicture:
+    def without(self, update: Update) -> KnownPicture:
         """The picture without an update that `learn` returned, with nothing forgotten since.
 
         A picture that contains a frame's own light would confirm its decisions, wrong or right.
         """
         rest = copy(self)
-        rest._sums = self._sums - update
+        rest._sums = self._sums - _rolled(update.sums, self._shift - update.shift)
         np.maximum(rest._sums[1:], 0, out=rest._sums[1:])
-        rest._made, rest._placed, rest._excess = None, None, self._excess.copy()
+        rest._made, rest._placed, rest.excess = None, None, self.excess.copy()
+        rest.adapted_excess = self.adapted_excess.copy()
         return rest
 
     def _update_of(self, observation: Observation) -> Float32Array:
@@ -116,7 +149,8 @@ class KnownPicture:
         Light and predicted light of a picture of 1, each weighted by the latter; predicted and measured mean light, as
         half of the slots are lit.
         """
-        expected = self._crosstalk @ _with_neighbours(observation.slots)
+        shares = self._crosstalk if observation.crosstalk is None else observation.crosstalk.shares.astype(np.float32)
+        expected = shares @ _with_neighbours(observation.slots)
         inside, row = observation.inside.astype(np.float32), observation.frame_row
         # If little light was predicted, the observed light may come from other slots.
         power = expected * expected
@@ -165,6 +199,8 @@ class PlacedPicture:
     black_level: np.float32
     #: (C,) variance of the columns' light over what is predicted; `judge` updates it in place.
     excess: Float32Array
+    #: The same where it is adapted to a frame.
+    adapted_excess: Float32Array
 
     @cached_property
     def _equations(self) -> RowEquations:
@@ -203,6 +239,63 @@ class PlacedPicture:
         tempered = precision / (self.excess[:, None] + np.float32(SETTINGS.common_error**2) * precision)
         tempered[precision <= _FAINT] = 0
         return ColumnLight(np.asarray(value, np.float32), np.asarray(tempered, np.float32))
+
+    def adapted(self, light: Float32Array, slots: Float32Array | None, rows_per_slot: float) -> PlacedPicture:
+        """The picture as the light of a frame shows it, where that differs from what was known.
+
+        The mean light of some symbols shows the picture whatever was sent; finer texture is kept by the share to which
+        it explains the light.
+
+        Args:
+            light: (C, S, R).
+            slots: (C, R) light of the columns; None: nothing was decided.
+            rows_per_slot: rows per slot.
+        """
+        half = max(int(SETTINGS.level_slots * rows_per_slot), 1)
+        own = np.float32(0.5) if slots is None else self.crosstalk @ _with_neighbours(slots)
+        inside = self.inside.astype(np.float32)
+        above, predicted = (light - self.black_level) * inside, self.picture * own * inside
+        total = box_sums(predicted, half) + _FAINT
+        gain = box_sums(above, half) / total
+        noise = box_sums(self.variance * inside, half) / np.square(total)
+        power = np.square(gain - 1)
+        gain = 1 + (gain - 1) * np.maximum(power - noise, 0) / (power + np.float32(TINY))
+        picture = self.picture * np.maximum(gain, 0)
+        smooth = box_sums(picture * inside, half) / (box_sums(inside, half) + _FAINT)
+        fine, weight = (picture - smooth) * own, inside / self.variance
+        error = above - smooth * own * inside
+        explained, most = (box_sums((weight * fine * values).sum(axis=1), half) for values in (error, fine))
+        share = np.clip((explained + 1) / (most + 1), 0, 1)[:, None]
+        return replace(self, picture=smooth + share * (picture - smooth), excess=self.adapted_excess)
+
+    def displacement(
+        self, light: Float32Array, slots: Float32Array, slope: Float32Array
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Columns by which the left and the right lie to the right of where they are taken to be, and their covariance.
+
+        Args:
+            light: (C, S, R).
+            slots: (C, R) light of the columns, from decided slots.
+            slope: (S, 3) change of the crosstalk with the place of a strip, per column.
+
+        Returns:
+            (2,) and (2, 2); None where nothing shows it.
+        """
+        around = _with_neighbours(slots)
+        error = light - self.black_level - self.picture * (self.crosstalk @ around)
+        change = self.picture * (slope @ around)
+        weighted = change * (self.inside / self.variance)
+        shown, information = ((weighted * each).sum(axis=2, dtype=np.float64).ravel() for each in (error, change))
+        right = (np.arange(shown.size) + 0.5) / shown.size
+        sides = np.stack([1 - right, right])
+        total = (sides * information) @ sides.T
+        if np.linalg.det(total) <= 0:
+            return None
+        inverse = np.linalg.inv(total)
+        off = inverse @ (sides @ shown)
+        # Errors are correlated over the rows of a strip, and not over strips.
+        left = sides * (shown - information * (off @ sides))
+        return off, inverse @ (left @ left.T) @ inverse
 
     def judge(
         self, observed: ColumnLight, expected: Float32Array, most: float, share: float, rows_per_slot: float
@@ -254,6 +347,18 @@ def _error_correlation(weighted: Float32Array, precision: Float32Array, rows_per
     of_all = squared.sum() / max(int(count.sum()), 1)
     ratio = (squared + SETTINGS.mean_error_slots * of_all) / (count + SETTINGS.mean_error_slots)
     return np.asarray(np.maximum(ratio, SETTINGS.min_correlated_error), np.float32)
+
+
+def _rolled(values: Float32Array, strips: int) -> Float32Array:
+    """(4, C, S, R) values moved to the right by some strips; 0 comes in."""
+    if not strips:
+        return values
+    flat = values.reshape(len(values), -1, values.shape[-1])
+    out, n = np.zeros_like(flat), flat.shape[1]
+    n_left = max(n - abs(strips), 0)
+    start, source = max(strips, 0), max(-strips, 0)
+    out[:, start : start + n_left] = flat[:, source : source + n_left]
+    return out.reshape(values.shape)
 
 
 def _with_neighbours(columns: Float32Array) -> Float32Array:

@@ -29,6 +29,8 @@ class KnownPictureSettings(msgspec.Struct, frozen=True):
     prior_precision: float = 4.0
     #: Error of a column's light, relative to full light, that is common to all strips.
     common_error: float = 0.04
+    #: Slots on each side whose mean light shows the picture: two symbols.
+    level_slots: float = 10.0
     #: Slots on each side over which a strip's error is averaged, and the inner ones that are left out.
     error_slots: float = 20.0
     own_slots: float = 1.3
