@@ -63,9 +63,9 @@ class ScreenPlace:
         """The place predicted for a frame, whose picture moved from corners (4, 2) `before` to corners `after`."""
         last = self.likelier
         together = replace(last, corners=geometry.carried(last.corners, before, after, self.lens))
-        # A hand that holds a film moves the screen by an unknown part of it.
-        unsure = SETTINGS.unsteady_share * self.off(together.corners, last)
-        resting = replace(last, covariance=last.covariance + np.diag(unsure**2))
+        # A camera in a hand moves the screen, too, by an unknown part of it, and both sides alike.
+        unsure = SETTINGS.unsteady_share * self.off(together.corners, last).mean()
+        resting = replace(last, covariance=last.covariance + unsure**2)
         shown = _log_odds_of_ends(frame, together.corners, resting.corners)
         return replace(self, together=together, resting=resting, log_odds=self.log_odds + shown)
 

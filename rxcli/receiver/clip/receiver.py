@@ -298,6 +298,7 @@ def _receive_anew(
         reception.snr,
         denoised,
         framing=acquired.framing,
+        changed=known.has_changed,
         joint=None if adds_up else JointSlots(reception.clock.burst, reception.posteriors),
     )
     if not tracks:

@@ -188,6 +188,7 @@ class TrackedScreen:
             light=light,
             pose=pose,
             tracked=True,
+            changed=self._changes,
         )
 
     def _long_view(
@@ -254,7 +255,7 @@ class TrackedScreen:
         something in front of the screen.
         """
         known = None
-        if not self._changes:
+        if not (self._changes or observed.changed):
             known = self._measured_by(picture, observed, clock, lit, max_misfit)
             # A picture of few frames is not known well.
             may_have_changed = lit is None and self._n_updates >= SETTINGS.first_frames
@@ -523,7 +524,8 @@ class TrackedScreen:
         columns = picture.solve(view.light)
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:
             return
-        observed = _Observed(view.context, pose, view.light, columns)
+        view.changed |= self._changes
+        observed = _Observed(view.context, pose, view.light, columns, view.changed)
         measured = self._measured(picture, observed, clock, known, SETTINGS.misfit)
         if measured is not None:
             view.clock, view.snr, view.metrics, view.tracked = measured.clock, measured.snr, measured.metrics, True
@@ -538,6 +540,8 @@ class _Observed:
     pose: Pose
     light: Float32Array
     columns: ColumnLight
+    #: Whether the picture was found to have changed.
+    changed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,6 +73,8 @@ class View:
     pose: Pose | None = None
     #: Whether the picture was known from other frames.
     tracked: bool = False
+    #: Whether the picture had changed since.
+    changed: bool = False
     #: Number of the frame's copy 0 in the clip.
     first_copy: int = 0
     #: Of a long exposure; the metrics are then those of every copy by itself.
