@@ -261,7 +261,8 @@ class TrackedScreen:
             may_have_changed = lit is None and self._n_updates >= SETTINGS.first_frames
             if known is None or not may_have_changed or (picture.excess < SETTINGS.changed_misfit).all():
                 return known
-        shown = picture.adapted(observed.light, None, clock.rows_per_slot)
+        # Decided slots show more than the mean light of symbols.
+        shown = picture.adapted(observed.light, None, clock.rows_per_slot) if lit is None else picture
         adapted = self._measured_by(shown, observed, clock, lit, max_misfit, adapts=True)
         if adapted is None:
             return known
