@@ -16,7 +16,8 @@ from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search.numbers import numbered
 from rxcli.receiver.search.outlines import possible_screens
 from rxcli.receiver.search.propose import likeliest_of_family
-from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, PacketResult
+from rxcli.results.reasons import sentence_of
+from rxcli.types import ColumnResult, FloatArray, Frame, FrameResult, PacketResult, Remark
 
 HEIGHT, WIDTH, ROWS_PER_SLOT, COLUMNS = 1600, 1200, 10.0, 20
 CORNERS = np.array([[150.0, 320.0], [1105.0, 290.0], [1130.0, 880.0], [120.0, 850.0]])
@@ -125,7 +126,7 @@ def of_doubtful_number(certainty: float) -> FrameResult:
 
 
 def test_a_doubtful_number_is_stated_and_asks_for_no_other_camera() -> None:
-    message = of_doubtful_number(0.3).numbering_remark
+    message = sentence_of(Remark("column_numbers", {"column": 3, "certainty": 0.3}))
     assert "numbered from the leftmost that was seen: it is the screen's column 3 with a probability of 0.30" in message
     assert Received(of_doubtful_number(0.3), {}).n_believable == 1
     weak = replace(of_doubtful_number(0.3), column_certainty=1.0)

@@ -185,8 +185,11 @@ INSIDE = np.array([[100.0, 50.0], [500.0, 50.0], [500.0, 300.0], [100.0, 300.0]]
 class _Shown(Located):
     """Packets of some evidence, of a short exposure or a long one, on a screen that may reach out of the picture."""
 
-    def __init__(self, evidence: float, is_long: bool = False, reaches_out: bool = False) -> None:
-        super().__init__(Outline(INSIDE * [10 if reaches_out else 1, 1]), None, None)
+    def __init__(
+        self, evidence: float, is_long: bool = False, reaches_out: bool = False, is_beside: bool = False
+    ) -> None:
+        width_px = np.ptp(INSIDE[:, 0])
+        super().__init__(Outline(INSIDE * [10 if reaches_out else 1, 1] + [is_beside * width_px / 10, 0]), None, None)
         self.__dict__.update(shown=evidence, long=is_long)
 
     evidence = property(lambda self: self.shown)
@@ -196,13 +199,14 @@ class _Shown(Located):
 @pytest.mark.parametrize(
     ("there", "elsewhere", "is_taken_there"),
     [
-        (_Shown(100), _Shown(90), True),
-        (_Shown(100), _Shown(110), False),
+        (_Shown(100), _Shown(90, is_beside=True), True),
+        (_Shown(100), _Shown(110, is_beside=True), False),
+        (_Shown(100), _Shown(110), True),
         (_Shown(100), _Shown(190, reaches_out=True), True),
         (_Shown(100), _Shown(210, reaches_out=True), False),
         (_Shown(100, is_long=True), _Shown(110), True),
         (_Shown(100), _Shown(110, is_long=True), True),
-        (Failure(Remark("no_stripes")), _Shown(50), False),
+        (Failure(Remark("no_stripes")), _Shown(50, is_beside=True), False),
         (Failure(Remark("no_stripes")), Failure("no_screen", "none"), True),
     ],
 )

@@ -16,6 +16,7 @@ from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, search
+from rxcli.receiver.search.evidence import USUAL_COLUMNS
 from rxcli.receiver.search.framing import Framing, framing_of
 from rxcli.receiver.search.settings import SETTINGS as search_settings
 from rxcli.receiver.still import initial_pass
@@ -165,7 +166,8 @@ class ClipCamera:
         here = there.evidence if isinstance(there, Located) else 0.0
         if isinstance(anywhere, Located) and not anywhere.is_long:
             has_left = _width_in_view(anywhere.outline.corners, cache.frame) < _width_in_view(corners, cache.frame)
-            is_same = np.abs(anywhere.outline.corners - corners)[:, 0].max() < _column_px(anywhere) / 2
+            distance_px = np.abs(anywhere.outline.corners - corners)[:, 0].max()
+            is_same = distance_px < np.ptp(corners[:, 0]) / (2 * USUAL_COLUMNS)
             if anywhere.evidence > (search_settings.borderless_gain if has_left or is_same else 1.0) * here:
                 return anywhere
         return there
@@ -222,10 +224,6 @@ class ClipCamera:
 
 def _framing_of(found: Found) -> Framing:
     return framing_of(found.best.acquisition, found.best.reception, found.screens)
-
-
-def _column_px(located: Located) -> float:
-    return float(np.ptp(located.outline.corners[:, 0])) / located.context.screens[0].columns
 
 
 def _width_in_view(corners: FloatArray, frame: Frame) -> float:

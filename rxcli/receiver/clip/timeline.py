@@ -90,7 +90,8 @@ class Timeline:
         if not (self.phase.settled and is_judged):
             copies = view.clock.to_copies(slot_llr(view.metrics)).transpose(1, 0, 2)
             shown = np.asarray(copies * (view.shown > 0), np.float64)
-            self.phase.update(first_copy, shown)
+            if not self.phase.settled:  # Bursts that were numbered keep their numbers.
+                self.phase.update(first_copy, shown)
             self.first_copies += [] if is_judged else [(tracking.slot_of_row_0(view.clock), shown)]
         return True
 

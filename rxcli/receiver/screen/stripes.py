@@ -24,6 +24,8 @@ def stripe_lean(pixels: NDArray[Any]) -> float:
 
     Positive: stripes run across the picture; negative: they run downwards; near 0: the picture has no stripes.
     """
+    if min(pixels.shape) <= (_MIN_GAP_PX + _LINE_PX) / (1 - 2 * _MARGIN):
+        return 0.0
     return _correlation(pixels) - _correlation(pixels.T)
 
 
