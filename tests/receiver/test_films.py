@@ -33,7 +33,7 @@ def received_of(take: Recording) -> Received:
 
 @pytest.fixture(scope="module")
 def pan() -> Recording:
-    return recording("pan:4")
+    return recording("pan:-3")
 
 
 @pytest.fixture(scope="module")

@@ -63,7 +63,7 @@ class ScreenPlace:
         """The place predicted for a frame, whose picture moved from corners (4, 2) `before` to corners `after`."""
         last = self.likelier
         together = replace(last, corners=geometry.carried(last.corners, before, after, self.lens))
-        # A camera in a hand moves the screen, too, by an unknown part of it, and both sides alike.
+        # A camera in a hand moves the screen, too, by an unknown part of it: both sides by the same.
         unsure = SETTINGS.unsteady_share * self.off(together.corners, last).mean()
         resting = replace(last, covariance=last.covariance + unsure**2)
         shown = _log_odds_of_ends(frame, together.corners, resting.corners)
