@@ -414,7 +414,7 @@ class PacketResult:
 _OfPicture = Literal["black", "saturated", "few_pixels", "too_tall", "no_columns", "lit", "no_columns_dark"]
 _OfOutline = Literal["no_columns_striped", "corners_far", "corners_outside", "corners_few_rows"]
 _OfStripes = Literal["no_stripes", "part_striped", "narrow_stripes", "no_stripes_across", "long_exposure"]
-_OfLight = Literal["steady_light", "one_lamp", "screen_dark", "nothing_lit", "unsure", "no_column"]
+_OfLight = Literal["steady_light", "one_lamp", "screen_dark", "nothing_lit", "unsure", "no_column", "not_searched"]
 _OfPackets = Literal["no_headers", "no_header", "part_in_view", "screen_fills_little", "packet_too_long"]
 _OfColumn = Literal["headerless", "echo", "out_of_view", "goes_on", "withheld", "incomplete", "dark", "uncertain"]
 _OfNumbers = Literal["not_read", "column_numbers", "one_column", "column_alone", "all_the_same", "one_screen_tried"]

@@ -29,6 +29,7 @@ from rxcli.receiver.search.evidence import USUAL_COLUMNS
 from rxcli.receiver.search.framing import framing_of
 from rxcli.receiver.search.outlines import no_screen, proposed_screens, too_small
 from rxcli.receiver.search.propose import nearest_screen
+from rxcli.receiver.search.refusal import ruled_out
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Frame, FrameResult, FrameSoftBits, OnTaps, Remark
@@ -78,8 +79,12 @@ def _in_total_order(options: ReceiverOptions) -> ReceiverOptions:
 
 def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None = None) -> FrameResult:
     """Receive one frame as a photograph; see `receive`."""
+    cache = FrameCache(frame)
+    if (reason := ruled_out(cache, options)) is not None:
+        result = failed(FrameResult(frame.source, frame.index, frame.time_s, "ok"), Failure(reason, "no_screen"))
+        return replace(result, remarks=(reason, Remark("not_searched")))
     with one_blas_thread():
-        cache = FrameCache(frame).in_blinking_colours()
+        cache = cache.in_blinking_colours()
         received = receive_either_way(cache, _in_total_order(options), _receive_still)
         soft = _with_cut_packets(cache, received, _in_total_order(options))
     result = _without_unlikely_screen(received.result, soft)

@@ -94,7 +94,7 @@ def striped_down() -> Frame:
         (lambda: taken(exposure_slots=17, exposure_s=17 / 17300), "long_exposure"),
         (straightened, "no_columns_striped"),
         (page, "steady_light"),
-        (lambda: page(1 / 60), "steady_light"),
+        (lambda: page(1 / 60), "long_exposure"),
         (dimmed, "steady_light"),
         (lambda: dimmed(0.25), "steady_light"),
         (striped_down, "stripes_down"),
@@ -114,6 +114,19 @@ def test_the_reason_is_true_of_the_picture(picture: Callable[[], Frame], reason:
     result = receive_frame(picture(), ReceiverOptions())
     assert not any(packet.is_believable for packet in result.packets)
     assert result.reason == reason
+
+
+def test_a_photo_that_states_an_exposure_of_many_slots_is_searched_on_request_or_where_it_shows_stripes() -> None:
+    options, stated = ReceiverOptions(), Metadata(exposure_s=1 / 60)
+    given_up = receive_frame(Frame(photo("coffee"), "photo", metadata=stated), options)
+    assert [remark.reason for remark in given_up.remarks] == ["long_exposure", "not_searched"]
+    assert "no_screen" in given_up.skipped
+    insisted = receive_frame(
+        Frame(photo("coffee"), "photo", metadata=stated), replace(options, skip=options.skip - {"no_screen"})
+    )
+    assert "not_searched" not in [remark.reason for remark in insisted.remarks]
+    striped = receive_frame(replace(frame_of(proportioned()), metadata=stated), options)
+    assert "not_searched" not in [remark.reason for remark in striped.remarks]
 
 
 def test_columns_out_of_the_picture_are_not_told_to_come_closer() -> None:

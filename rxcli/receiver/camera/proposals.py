@@ -75,8 +75,9 @@ def propose(
         found = [clock for clock in found if clock.exposure_slots < LONG_EXPOSURE_SLOTS]
     short = _distinct(clock for clock in found if not any(_is_same(clock, better) for better in smeared))
     ranked = sorted(smeared + short, key=lambda clock: -clock.score)
-    likely = [clock for clock in ranked if clock.score >= SETTINGS.min_score]
-    return [replace(clock, number=number) for number, clock in enumerate(likely or ranked[:1])]
+    least = {False: SETTINGS.min_score, True: SETTINGS.min_long_score}
+    likely = [clock for clock in ranked if clock.score >= least[clock.exposure_slots > LONG_EXPOSURE_SLOTS]]
+    return [replace(clock, number=number) for number, clock in enumerate(likely or short[:1])]
 
 
 def propose_slots(strips: ColumnStrips, *, may_bend: bool = True) -> list[CameraHypothesis]:

@@ -43,6 +43,9 @@ class EstimateSettings(msgspec.Struct, frozen=True):
     same_clock: float = 4e-3
     n_proposed: int = 5
     min_score: float = 40.0
+    #: The same of long exposures, whose passes are costly: photographs without a screen reach 40 to 76, mostly, and
+    #: right ones with packets 77 and more.
+    min_long_score: float = 75.0
 
     #: Error of a period over the picture, slots: by the copies of packets, and by the line of a long exposure.
     period_error: tuple[float, float] = (0.25, 0.0625)

@@ -189,17 +189,25 @@ def common_light(frame: Frame) -> Remark | None:
     return Remark("steady_light" if is_even else "on_its_side")
 
 
+def useless(frame: Frame) -> Remark | None:
+    """Why a frame shows nothing of any screen, or None."""
+    return find.why_useless(frame.pixels, *_range_of(frame))
+
+
+def _range_of(frame: Frame) -> tuple[float, float]:
+    """Black and white of a frame's pixels."""
+    levels = frame.mosaic
+    return (frame.black, frame.white) if levels is None else (float(np.mean(levels.black)), levels.white)
+
+
 def reason_for_none(cache: FrameCache) -> Remark:
     """Why no screen was found in a frame."""
     frame = cache.frame
-    levels = frame.mosaic
-    black, white = (frame.black, frame.white) if levels is None else (float(np.mean(levels.black)), levels.white)
-    useless = find.why_useless(frame.pixels, black, white)
-    if useless is not None:
-        return useless
-    is_striped = levels is None and lean_of(cache) > MIN_LEAN
+    if (reason := useless(frame)) is not None:
+        return reason
+    is_striped = frame.mosaic is None and lean_of(cache) > MIN_LEAN
     common = common_light(frame) if is_striped else None
-    mean = float(find.thinned(frame.pixels, black, white).mean())
+    mean = float(find.thinned(frame.pixels, *_range_of(frame)).mean())
     # Rows have noise in common in the dark.
     if mean < SETTINGS.dark_mean and (common is None or common.reason == "on_its_side"):
         return Remark("no_columns_dark", {"mean_percent": 100 * max(mean, 0.0)})

@@ -15,10 +15,11 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception, dark_columns, shows_steady_light
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.frame.settings import SETTINGS as PASSES
+from rxcli.receiver.light import MAX_EXPOSURE_SLOTS
 from rxcli.receiver.plane.orientation import PORTRAIT
 from rxcli.receiver.screen.stripes import MIN_LEAN, common_stripes
 from rxcli.receiver.search.hypothesis import Hypothesis
-from rxcli.receiver.search.outlines import common_light, lean_of, too_small
+from rxcli.receiver.search.outlines import common_light, lean_of, too_small, useless
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import as_one_column
@@ -27,6 +28,18 @@ from rxcli.types import BELIEVABLE, FrameResult, Remark, RowProfiles
 
 #: Reasons that nothing makes likelier.
 _PLAIN = ("steady_light", "one_lamp", "black", "saturated", "few_pixels", "too_tall", "portrait")
+
+
+def ruled_out(cache: FrameCache, options: ReceiverOptions) -> Remark | None:
+    """Why a picture cannot show packets, before any search: its stated exposure, and no stripes that contradict it."""
+    frame = cache.frame
+    exposure_s = frame.metadata.exposure_s or 0.0
+    slots = exposure_s * min(screen.slot_rate_hz for screen in options.screens)
+    if slots < MAX_EXPOSURE_SLOTS or "no_screen" not in options.skip:
+        return None
+    if (frame.mosaic is None and lean_of(cache) > MIN_LEAN) or useless(frame) is not None:
+        return None
+    return Remark("long_exposure", {"exposure_s": exposure_s, "slots": slots})
 
 
 def likeliest_reason(cache: FrameCache, result: FrameResult, options: ReceiverOptions) -> tuple[Remark, ...]:
