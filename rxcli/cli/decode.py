@@ -17,12 +17,7 @@ from rxcli.cli.kinds import FILE, FOLDER, SHARE
     ("--json=FILE|- json_path", str, None, "Write one JSON object a frame, instead of the table."),
     ("--truth=FILE|auto", str, None, "Score against this truth, or the NAME.truth.json beside each file."),
     ("--max-ber", SHARE, None, "Fail a file whose bit error rate is above (needs --truth)."),
-    (
-        "--min-packets",
-        click.IntRange(1),
-        1,
-        "Fail a file with fewer packets of --min-confidence (0.5) and texts.",
-    ),
+    ("--min-packets", click.IntRange(1), 1, "Fail a file with fewer packets of --min-confidence (0.5) and texts."),
     ("--expect-text expected_texts", [str], None, "Fail a file that does not give this text; several times."),
     ("--baseline=FILE", FILE, None, "Fail a file that lost packets, or is slower, since this --json run."),
     ("--slower", click.FloatRange(1), 1.5, "How many times as long as in the --baseline a file may take."),

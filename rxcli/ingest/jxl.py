@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.ingest.luma import BT601, Weights
 from rxcli.ingest.metadata import exif_metadata, turned
 from rxcli.ingest.sniff import check_size, damage_explained
 from rxcli.types import Metadata
@@ -22,8 +21,8 @@ _NOTE_BYTES = 1 << 20
 _BYTES_A_PIXEL = 30
 
 
-def read_jxl(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]:
-    """Samples as stored, metadata with the orientation that the code asks for, and the weights of luma.
+def read_jxl(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata]:
+    """Samples as stored, and metadata with the orientation that the code asks for.
 
     Raises:
         InputError: damaged, too large.
@@ -41,11 +40,7 @@ def read_jxl(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]:
         pixels = np.rint(np.clip(pixels, 0, 1) * np.float32(65535)).astype(np.uint16)
     elif pixels.dtype == np.uint16:
         pixels <<= max(16 - bits, 0)
-    return (
-        pixels,
-        turned(exif_metadata(_metadata_block(data, b"Exif"), _metadata_block(data, b"xml ")), orientation),
-        BT601,
-    )
+    return pixels, turned(exif_metadata(*(_metadata_block(data, kind) for kind in (b"Exif", b"xml "))), orientation)
 
 
 def _content(data: bytes, kind: bytes) -> bytes:

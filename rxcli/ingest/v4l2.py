@@ -343,16 +343,14 @@ _MISSING = "plug it in, or see `v4l2-ctl --list-devices`; --wait waits for it"
 _ROOM = "lower --width, --height or --fps, take --format MJPG, or give it a USB port apart from other cameras"
 _REFUSED = "no V4L2 camera, or one that refuses its own mode"
 _FAILURES = {
-    errno.ENOENT: (CameraLost, "no such camera", _MISSING),
-    errno.ENXIO: (CameraLost, "no such camera", _MISSING),
+    **dict.fromkeys((errno.ENOENT, errno.ENXIO), (CameraLost, "no such camera", _MISSING)),
     errno.ENODEV: (CameraLost, "the camera was unplugged", _PLUG),
     errno.EBUSY: (CameraLost, "another program uses the camera", "close it (`fuser -v {path}` names it)"),
     errno.ENOSPC: (CameraLost, "its USB port has no room left for this mode", _ROOM),
     errno.ENOMEM: (CameraLost, "the driver has no memory for this mode", "lower --width and --height"),
     errno.EPERM: (InputError, "this process may not use it", "give its container the device, or lift the rule"),
     errno.EACCES: (InputError, "permission denied", "add yourself to the group `video` and log in again"),
-    errno.ENOTTY: (InputError, _REFUSED, "name another /dev/video device"),
-    errno.EINVAL: (InputError, _REFUSED, "name another /dev/video device"),
+    **dict.fromkeys((errno.ENOTTY, errno.EINVAL), (InputError, _REFUSED, "name another /dev/video device")),
 }
 
 
@@ -505,10 +503,8 @@ def _set_controls(descriptor: int, settings: CameraSettings, width: int, path: P
         raise InputError(f"{path}: the camera {lacks}", "leave --exposure out")
     if settings.gain is not None:
         _set(descriptor, api.V4L2_CID_AUTOGAIN, 0)
-        gains = (
-            _set(descriptor, control, settings.gain) for control in (api.V4L2_CID_GAIN, api.V4L2_CID_ANALOGUE_GAIN)
-        )
-        if all(gain is None for gain in gains):
+        controls = api.V4L2_CID_GAIN, api.V4L2_CID_ANALOGUE_GAIN
+        if all(_set(descriptor, control, settings.gain) is None for control in controls):
             raise InputError(f"{path}: the camera has no gain control", "leave --gain out")
     return None if units is None or unit_s is None else units * unit_s
 

@@ -140,12 +140,7 @@ def _receive_screen(
     # Packets, with the probability that they are right.
     columns = assemble.column_results(
         assemble.FrameColumns(
-            reception.clock,
-            reception.snr,
-            no_header,
-            options.min_confidence,
-            outline.certainty,
-            framing.bursts,
+            reception.clock, reception.snr, no_header, options.min_confidence, outline.certainty, framing.bursts
         ),
         reception.posteriors,
         reception.n_observed,

@@ -31,15 +31,7 @@ from rxcli.receiver.light import (
 )
 from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.sync.settings import SETTINGS as sync_settings
-from rxcli.types import (
-    BurstPosteriors,
-    BurstSamples,
-    Clock,
-    Denoiser,
-    Float32Array,
-    FloatArray,
-    SlotSamples,
-)
+from rxcli.types import BurstPosteriors, BurstSamples, Clock, Denoiser, Float32Array, FloatArray, SlotSamples
 
 #: Least distance of a slot's probability from 0 and 1.
 _MIN_DOUBT = 1e-4

@@ -22,11 +22,10 @@ _STILL, _FEW = 0.01, 0.5
 _CLOSER = "Move closer, until the screen fills the picture."
 _NEARER = f"{_CLOSER[:-1]}, and hold the camera level with it."
 _TURN = "Turn the camera, until its long side lies along the screen's."
+_SIDEWAYS = "The screen lies on its side in the picture."
 #: For those who aim: reason and next step, instead of those of photos.
 _AIMING: dict[Reason | None, tuple[str, str]] = {
-    **dict.fromkeys(
-        ("portrait", "on_its_side", "stripes_down"), ("The screen lies on its side in the picture.", _TURN)
-    ),
+    **dict.fromkeys(("portrait", "on_its_side", "stripes_down"), (_SIDEWAYS, _TURN)),
     **dict.fromkeys(("no_columns", "no_columns_dark", "lit"), ("No screen that sends is in view.", _NEARER)),
     "no_columns_striped": ("Stripes show, but no columns of a screen.", _NEARER),
     "part_striped": ("Only a part of the picture shows stripes.", _CLOSER),

@@ -2,14 +2,15 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import cache
-from typing import Any, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 from rxcli.errors import UsageError
 from rxcli.types import ColumnResult, FrameResult, Message, ObjectProgress, PacketResult, Reason, ReceivedObject, Remark
 
+_T = TypeVar("_T")
 #: Fields of a record in their order, with the decimals that are written; None: as it is, `_SIGNIFICANT`: seven digits.
 _SIGNIFICANT = -1
 _FRAME = {"source": None, "frame": None, "time_s": 6, "status": None}
@@ -128,7 +129,7 @@ def from_record(record: dict[str, Any]) -> FrameResult:
         files = [{**o, **place, "n_blocks": o["blocks"]} for o in record.get("objects", ())]
         under_way = [{**p, "n_blocks": p["blocks"]} for p in record.get("objects_incomplete", ())]
         messages = [_read(m, Message, data=bytes.fromhex(m["hex"]), **place) for m in record.get("messages", ())]
-        result: FrameResult = _read(
+        return _read(
             {**record, **about},
             FrameResult,
             corners=None if corners is None else np.array(corners, dtype=np.float64).reshape(4, 2),
@@ -140,17 +141,13 @@ def from_record(record: dict[str, Any]) -> FrameResult:
             progress=tuple(_read(file, ObjectProgress) for file in under_way),
             retry=record.get("retry") is True,
         )
-        return result
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         shown = f"{error!r:.200}"
         raise UsageError(f"not a result line of `vlc-rx decode --json` ({shown})", "name another file") from None
 
 
 def _column(record: dict[str, Any]) -> ColumnResult:
-    column: ColumnResult = _read(
-        record, ColumnResult, packets=tuple(map(_packet, record["packets"])), remark=_remark(record)
-    )
-    return column
+    return _read(record, ColumnResult, packets=tuple(map(_packet, record["packets"])), remark=_remark(record))
 
 
 def _remark(record: dict[str, Any]) -> Remark | None:
@@ -162,13 +159,13 @@ def _remark(record: dict[str, Any]) -> Remark | None:
 
 
 def _packet(record: dict[str, Any]) -> PacketResult:
-    packet: PacketResult = _read(record, PacketResult)
+    packet = _read(record, PacketResult)
     if len(packet.payload_bytes) != -(-packet.payload_bits // 8):
         raise ValueError("payload and payload_bits disagree")
     return packet
 
 
-def _read(record: dict[str, Any], kind: Any, **known: Any) -> Any:
+def _read(record: dict[str, Any], kind: Callable[..., _T], **known: Any) -> _T:
     """A dataclass of the fields of a record by name; null is NaN where a number must stand."""
     import msgspec
 

@@ -201,10 +201,8 @@ class Decoder:
             taken = collector.add(result)
             if last:
                 taken = collector.finish(taken)
-                alone = number == 0 and not (taken.messages or taken.objects)
-                taken = replace(
-                    taken, soft_bits=result.soft_bits if alone else None, files=() if alone else taken.files
-                )
+                if number == 0 and not (taken.messages or taken.objects):
+                    taken = replace(taken, soft_bits=result.soft_bits, files=())
             yield explained(taken)
 
     def _frames(self, source: Source, problems: list[tuple[str, bool]]) -> Iterator[Frame]:

@@ -318,12 +318,10 @@ class Server:
         if name is None or name not in own_names:  # perhaps one that somebody else has pointed at this machine
             return _refused(403, "the page was asked for by another name than its own", _PROXY)
         is_visit = request.method == "GET" and request.headers.get("Sec-Fetch-Dest") == "document"
-        sender, (_, _, origin) = (
-            request.headers.get("Sec-Fetch-Site"),
-            request.headers.get("Origin", "").partition("://"),
-        )
-        if sender is None and "Origin" in request.headers:  # without encryption, browsers state the origin alone
-            is_own = bool(origin) and origin in (host, request.headers.get("X-Forwarded-Host"))
+        headers = request.headers
+        sender, origin = headers.get("Sec-Fetch-Site"), headers.get("Origin", "").partition("://")[2]
+        if sender is None and "Origin" in headers:  # without encryption, browsers state the origin alone
+            is_own = bool(origin) and origin in (host, headers.get("X-Forwarded-Host"))
             is_shown = site.proxy_name is not None and _name_of(origin) == site.proxy_name
             sender = "same-origin" if is_own or is_shown else "cross-site"
         if not is_visit and sender not in (None, "none", "same-origin"):

@@ -234,13 +234,8 @@ def write_capture(
     scene = recording.scene
     if file_format in CODECS:
         bits = 16 if CODECS[file_format].bits > 8 else 8
-        write_video(
-            recording.pictures(bits, progress),
-            path,
-            Encoding(file_format, bit_rate),
-            scene.frame_rate_hz,
-            scene.orientation,
-        )
+        pictures, encoding = recording.pictures(bits, progress), Encoding(file_format, bit_rate)
+        write_video(pictures, path, encoding, scene.frame_rate_hz, scene.orientation)
     elif file_format == "jpeg":
         path.write_bytes(recording.frame().jpeg)
     elif file_format.startswith("dng"):

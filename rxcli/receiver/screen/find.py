@@ -318,11 +318,7 @@ def _stands_out(strips: PictureStrips, grid: Grid, least: float = 1.0) -> bool:
 
 
 def _numbered(
-    strips: PictureStrips,
-    grid: Grid,
-    layouts: Sequence[ColumnLayout],
-    parts: Sequence[FloatArray] = (),
-    rank: int = 0,
+    strips: PictureStrips, grid: Grid, layouts: Sequence[ColumnLayout], parts: Sequence[FloatArray] = (), rank: int = 0
 ) -> list[Outline]:
     """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
     light, profile = _light_across(strips, grid, layouts[0].sigma, parts)
