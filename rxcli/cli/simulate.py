@@ -134,7 +134,7 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
     scene = _with_pose(scene, options)
     changes: dict[str, Callable[[Any], Scene]] = {
         "readout_s": lambda seconds: scene.read_in(seconds),
-        "exposure_slots": lambda slots: scene.metered(slots / scene.screen.slot_rate_hz),
+        "exposure_slots": lambda slots: scene.metered(slots),
         "exposure_s": lambda seconds: replace(scene, exposure_s=seconds),
         "electrons": lambda electrons: replace(scene, light_e_per_s=electrons / scene.exposure_s),
         "column_delays": lambda text: replace(scene, column_delay_slots=_delays(text, scene.screen.columns)),

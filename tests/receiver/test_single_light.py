@@ -118,7 +118,7 @@ def test_one_column_alone_has_no_number() -> None:
         out[7] = slots[slot.astype(np.int64) % 70]
         return out
 
-    trial = simulate_trial(replace(scene, waveform=waveform, picture="white").metered(0.9 / 8650), 1)
+    trial = simulate_trial(replace(scene, waveform=waveform, picture="white").metered(0.9), 1)
     (result,) = receive([trial.frame], ReceiverOptions())
     assert [remark.reason for remark in result.remarks] == ["one_column"]
     assert len(result.packets) == 1

@@ -187,9 +187,7 @@ def scene_at(
     screen = msgspec.structs.replace(screen, name="sweep", **clock)
     scene = preset(camera, screen)
     scene = replace(scene, light_e_per_s=scene.light_e_per_s * light, pose=replace(scene.pose, **(pose or {})))
-    scene = replace(scene, picture=picture, n_frames=1)
-    if exposure_slots is not None:
-        scene = scene.metered(exposure_slots / screen.slot_rate_hz)
+    scene = replace(scene, picture=picture, n_frames=1).metered(exposure_slots)
     return binned(scene, screen.columns * _PX_PER_COLUMN / scene.sensor.width) if is_binned else scene
 
 

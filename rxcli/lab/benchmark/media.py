@@ -53,8 +53,7 @@ class Medium:
         """The scene of a photograph, or of a clip whose payload comes again after its last frame."""
         scene = preset(self.camera, self.screen)
         scene = replace(scene, picture=self.picture, light_e_per_s=scene.light_e_per_s * self.light)
-        if self.exposure_slots is not None:
-            scene = scene.metered(self.exposure_slots / scene.screen.slot_rate_hz)
+        scene = scene.metered(self.exposure_slots)
         if not self.is_screen:
             pose = replace(scene.pose, fill=_BEYOND_EDGES)
             scene = replace(scene, waveform=np.ones_like, dimming="none", panel=0.0, pose=pose)

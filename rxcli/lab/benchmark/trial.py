@@ -63,9 +63,9 @@ class Trial:
         return ReceiverOptions(**known, force_camera=True, corners=corners, **more)
 
 
-def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False, threads: int = 1) -> Trial:
+def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False) -> Trial:
     """Simulate one frame of `scene`; equal seeds give equal pixels."""
-    return Trial(simulate_frame(scene, np.random.default_rng(seed), oracle=oracle, threads=threads))
+    return Trial(simulate_frame(scene, np.random.default_rng(seed), oracle=oracle, threads=1))
 
 
 def write_still(capture: Capture, stem: Path) -> Path:
@@ -86,13 +86,11 @@ def known_camera(exposure: Exposure) -> CameraProfile:
 def known_corners(exposure: Exposure) -> FloatArray:
     """(4, 2) the screen's corners on the stored picture, top-left first, clockwise for a viewer."""
     corrected = exposure.scene.isp.correct_distortion and not exposure.scene.is_mosaic
-    return corners_on_picture(exposure.view, True) if corrected else exposure.corners
+    return corrected_corners(exposure.view) if corrected else exposure.corners
 
 
-def corners_on_picture(view: View, corrected: bool) -> FloatArray:
-    """(4, 2) corners of the screen on a picture whose distortion was corrected in the camera, or not."""
-    if not corrected:
-        return view.corners
+def corrected_corners(view: View) -> FloatArray:
+    """(4, 2) corners of the screen on a picture whose distortion was corrected in the camera."""
     matrix = view.camera_matrix
     return np.asarray(view.pixels_to_ideal(view.corners) * matrix[[0, 1], [0, 1]] + matrix[:2, 2])
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli import protocol
-from rxcli.lab.benchmark.trial import SOURCE, Trial, corners_on_picture
+from rxcli.lab.benchmark.trial import SOURCE, Trial, corrected_corners
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS, codebook, payload_bits
 from rxcli.results.undistort import undistorted
@@ -61,7 +61,7 @@ def column_waves(trial: Trial) -> tuple[FloatArray, float]:
     corrected = scene.isp.correct_distortion and not scene.is_mosaic
     picture = undistorted(frame, Lens(view.camera_matrix, np.array(scene.lens.distortion), corrected))
     # Corners where a lens without distortion would show them.
-    plane = corners_on_picture(view, corrected=True)
+    plane = corrected_corners(view)
     top_left, top_right, bottom_right, bottom_left = plane
     width = max(round(float(np.linalg.norm(top_right - top_left))), scene.screen.columns)
     height = max(round(float(np.linalg.norm(bottom_left - top_left))), 2)

@@ -91,14 +91,14 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         if width_px < _NARROW_PX:
             panel = dict(zip(("width_px", "height_px"), _SMALL_PANEL_PX, strict=True))
             scene = replace(scene, screen=msgspec.structs.replace(scene.screen, **panel))
-        exposure_s = log_uniform(rng, self.exposure_slots) / scene.screen.slot_rate_hz
+        exposure_slots = log_uniform(rng, self.exposure_slots)
         light_e_per_s = log_uniform(rng, _LIGHT)
         full_scale_e = light_e_per_s * scene.exposure_s * scene.isp.gain * rng.uniform(*_HEADROOM)
         sensor = replace(scene.sensor, full_scale_e=full_scale_e)
         scene = replace(scene, light_e_per_s=light_e_per_s * _within(rng, self.light), sensor=sensor)
         roll, yaw, pitch = self.aim * rng.normal(0, _ANGLES_DEG)
         turned = rng.random() < _UPSIDE_DOWN
-        scene = replace(scene.metered(exposure_s), orientation=3 if turned else 1)
+        scene = replace(scene.metered(exposure_slots), orientation=3 if turned else 1)
         place = np.clip(self.aim * rng.normal(0, _PLACE, 2), -1, 1)
         return placed(scene, rng.uniform(*self.fill), (roll + 180 * turned, yaw, pitch), place)
 

@@ -145,8 +145,9 @@ class Scene:
         light_e_per_s = self.light_e_per_s * (self.exposure_s / exposure_s) * factor
         return replace(self, exposure_s=exposure_s, light_e_per_s=light_e_per_s)
 
-    def metered(self, exposure_s: float) -> Self:
+    def metered(self, slots: float | None) -> Self:
         """The scene at another exposure, the gain set by it: white stays white, and electrons grow with the time."""
+        exposure_s = self.exposure_s if slots is None else slots / self.screen.slot_rate_hz
         ratio = exposure_s / self.exposure_s
         sensor = replace(self.sensor, full_scale_e=self.sensor.full_scale_e * ratio)
         return replace(self, exposure_s=exposure_s, sensor=sensor, iso=max(round(self.iso / ratio), 25))
