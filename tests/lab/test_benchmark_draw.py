@@ -17,7 +17,6 @@ from rxcli.lab.benchmark.runner import scenarios
 from rxcli.lab.simulate.capture import warped
 from rxcli.lab.simulate.files import Encoding
 from rxcli.lab.simulate.no_data import EVEN_KINDS, STRIPED_KINDS
-from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.pictures import DARK_KINDS, draw_dark_picture
 from rxcli.lab.simulate.population import Population
 from rxcli.lab.simulate.scenes import preset
@@ -58,7 +57,7 @@ def test_points_of_populations_can_be_drawn(name: str) -> None:
         sensor = scene.sensor
         if people.width_px is not None:
             assert people.width_px[0] <= sensor.width + 0.5 <= people.width_px[1] + 1
-        corners = View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect).corners
+        corners = scene.view.corners
         assert (corners > -0.1 * sensor.width).all()
         assert people.encoding(scene, np.random.default_rng(1))[0] in people.codecs
 
@@ -191,7 +190,7 @@ def test_tilted_screens_stay_in_view_and_zero_tilt_draws_as_before() -> None:
     for number in range(8):
         scene, _ = tilted.draw(np.random.default_rng(number))
         sensor = scene.sensor
-        corners = View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect).corners
+        corners = scene.view.corners
         assert (corners > -1).all()
         assert (corners < [sensor.width, sensor.height]).all()
 

@@ -95,10 +95,9 @@ class Recording:
         change = max((c for c in scene.changes if c.frame <= frame), key=lambda c: c.frame, default=Change(0))
         blur_px = scene.blur_px if change.blur_px is None else change.blur_px
         scene = replace(scene, light_e_per_s=scene.light_e_per_s * change.light, blur_px=blur_px)
-        sensor, start_slot = scene.sensor, self.start_slot + time_s * self.scene.real_slot_rate_hz
-        view = View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect)
+        start_slot, motion = self.start_slot + time_s * scene.real_slot_rate_hz, self._motion(scene.view)
         clock = start_slot, scene.real_slot_rate_hz, self.delays, time_s
-        return Exposure(scene, view, self.drive, self.link, *clock, motion=self._motion(view), player=self.player)
+        return Exposure(scene, scene.view, self.drive, self.link, *clock, motion=motion, player=self.player)
 
     def _motion(self, view: View) -> HandMotion | None:
         if not self.scene.hand_px:

@@ -9,7 +9,7 @@ import numpy as np
 
 from rxcli.lab.simulate.film import FilmKind, draw_film
 from rxcli.lab.simulate.isp import Isp
-from rxcli.lab.simulate.optics import FloatArray, Lens, Pose, View
+from rxcli.lab.simulate.optics import FloatArray, Lens, Pose
 from rxcli.lab.simulate.pictures import DARK_KINDS, PHOTOS, draw_dark_picture, draw_part
 from rxcli.lab.simulate.scenes import Scene, preset, with_fields
 
@@ -75,7 +75,7 @@ class Population(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         """A scene of this population, and what its screen shows: a photograph's name or one of `DARK_KINDS`."""
         while True:
             scene = self._taken(rng)
-            heights = np.clip(_view(scene).corners[:, 1], 0, scene.sensor.height - 1)
+            heights = np.clip(scene.view.corners[:, 1], 0, scene.sensor.height - 1)
             packets = np.ptp(heights) / scene.rows_per_slot / scene.screen.packet_slots
             if self.packets[0] <= packets <= self.packets[1]:
                 return self._shown(scene, rng)
@@ -149,17 +149,12 @@ def _as_phone(scene: Scene, readout_s: float, rng: Generator) -> Scene:
     return replace(scene.read_in(readout_s), lens=lens, isp=isp)
 
 
-def _view(scene: Scene) -> View:
-    sensor = scene.sensor
-    return View(scene.screen, scene.lens, scene.pose, sensor.width, sensor.height, sensor.pixel_aspect)
-
-
 def placed(scene: Scene, share: float, angles: tuple[float, float, float], place: FloatArray) -> Scene:
     """The scene with a screen of a share of the picture, at `place` (-1..1) of the room that is left."""
     size = np.array([scene.sensor.width, scene.sensor.height])
     scene = replace(scene, pose=Pose(0.9, *angles))
     for _ in range(12):
-        pose, corners = scene.pose, _view(scene).corners
+        pose, corners = scene.pose, scene.view.corners
         low, high = corners.min(axis=0), corners.max(axis=0)
         goal = size / 2 + place * np.maximum(size - (high - low), 0) / 2
         x, y = 0.9 * (goal - (low + high) / 2) / size

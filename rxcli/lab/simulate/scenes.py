@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rxcli.errors import UsageError
 from rxcli.lab.simulate.film import Film
 from rxcli.lab.simulate.isp import Isp
-from rxcli.lab.simulate.optics import Lens, Pose
+from rxcli.lab.simulate.optics import Lens, Pose, View
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.lab.simulate.transmitter import Dimming, LabelSource, Waveform, Weights
 from rxcli.profiles import ScreenProfile, load_profile
@@ -129,6 +129,11 @@ class Scene:
     def is_mosaic(self) -> bool:
         """Whether a frame in memory is the sensor's mosaic; a sensor without filter array is always developed."""
         return self.output == "raw" and self.sensor.cfa != "rgb"
+
+    @property
+    def view(self) -> View:
+        """How the camera sees the screen."""
+        return View(self.screen, self.lens, self.pose, self.sensor.width, self.sensor.height, self.sensor.pixel_aspect)
 
     @property
     def real_slot_rate_hz(self) -> float:
