@@ -48,7 +48,7 @@ class SurvivorSettings(msgspec.Struct, frozen=True):
     """Joint detection of slots and picture."""
 
     #: Most paths that are kept.
-    max_paths: int = 24
+    max_paths: int = 48
     #: Effective number of independent samples per slot and strip.
     information: float = 0.5
     #: Change of the picture per slot, its deviation at the start, both relative; degrees of freedom of its errors.
