@@ -250,6 +250,8 @@ def _fit_near(
     flat = np.hstack([slow, *_waves(rows, frequency, n_harmonics)])
     linear = np.linalg.lstsq(flat, profile, rcond=None)[0]
     start = np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
+    if profile.size < start.size:  # Too few rows to determine them.
+        return None
     found = least_squares(residual, start, jacobian, method="lm", x_scale="jac", xtol=1e-10, ftol=1e-7, max_nfev=40)
     state, left = found.x, found.fun
     if abs(state[-1] - frequency) > 0.6 / n:

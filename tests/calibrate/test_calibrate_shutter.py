@@ -77,6 +77,12 @@ def two_spots(left_hz: float, right_hz: float, duty: float, seed: int) -> Any:
     return exposed(left + right, np.random.default_rng(seed))
 
 
+@pytest.mark.parametrize("n_rows", range(5, 20))
+def test_few_rows_determine_no_fit_and_do_not_fail(n_rows: int) -> None:
+    fit = fit_periodic(np.random.default_rng(1).normal(size=n_rows), 0.3)
+    assert fit is None or fit.residual.size == n_rows
+
+
 def test_lamps_of_different_frequency_each_have_their_region() -> None:
     picture = two_spots(1000, 1370, 0.3, 5)
     result = calibrate_shutter([picture], [1370, 1000], "rows")
