@@ -196,7 +196,7 @@ def _receive(state: Tracking | Lost, frame: Frame, located: Located | Failure | 
         waiting.update(skipped={"tracking": 1})
         state = replace(state, known=replace(state.known, corners=state.scene.corners))
     else:
-        if isinstance(state, Tracking):
+        if isinstance(state, Tracking) and state.known.camera.fits(frame):
             log_odds = state.scene.film_log_odds
             state = replace(state, known=replace(state.known, film_log_odds=log_odds, has_changed=True))
         state, view, report = _receive_anew(state.known, cache, located)
