@@ -166,13 +166,12 @@ class TrackedScreen:
         if clock is None:
             return None
         context = replace(last.context, cache=cache, sampled_corners=self.corners)
+        observed, bursts = _Observed(context, pose, light, likely, columns), timeline.assigned(frame, clock)
         if decides_jointly(clock):
-            bursts, observed = timeline.assigned(frame, clock), _Observed(context, pose, light, columns)
             return self._long_view(cache, observed, likely, clock, bursts, max_misfit)
         with timer("detect"):
-            bursts = timeline.assigned(frame, clock)
             clock = clock.by_copy if bursts is None else replace(clock, burst=bursts)
-            measured = self._measured(picture, _Observed(context, pose, light, columns), clock, None, max_misfit)
+            measured = self._measured(picture, observed, clock, None, max_misfit)
             if measured is None:
                 return None
             clock, metrics, snr = measured.clock, measured.metrics, measured.snr
@@ -261,8 +260,9 @@ class TrackedScreen:
             may_have_changed = lit is None and self._n_updates >= SETTINGS.first_frames
             if known is None or not may_have_changed or (picture.excess < SETTINGS.changed_misfit).all():
                 return known
-        # Decided slots show more than the mean light of symbols.
-        shown = picture.adapted(observed.light, None, clock.rows_per_slot) if lit is None else picture
+        shown = observed.picture
+        if lit is None and shown is picture:  # Decided slots show more than the mean light of symbols.
+            shown = picture.adapted(observed.light, None, clock.rows_per_slot)
         adapted = self._measured_by(shown, observed, clock, lit, max_misfit, adapts=True)
         if adapted is None:
             return known
@@ -287,7 +287,7 @@ class TrackedScreen:
         """The same by one picture, which is adapted to the frame by its decided slots if it `adapts`."""
         rows, light, isi_memory = observed.pose.rows, observed.light, self._isi_memory
         positions = known_picture.row_positions(rows, clock)
-        columns = picture.solve(light)
+        columns = observed.columns if picture is observed.picture else picture.solve(light)
         if lit is None:
             lit = known_picture.first_decision(columns, positions, clock)
         fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
@@ -526,7 +526,7 @@ class TrackedScreen:
         if _header_contrast(columns, pose.rows, clock) < SETTINGS.min_header:
             return
         view.changed |= self._changes
-        observed = _Observed(view.context, pose, view.light, columns, view.changed)
+        observed = _Observed(view.context, pose, view.light, picture, columns, view.changed)
         measured = self._measured(picture, observed, clock, known, SETTINGS.misfit)
         if measured is not None:
             view.clock, view.snr, view.metrics, view.tracked = measured.clock, measured.snr, measured.metrics, True
@@ -536,10 +536,12 @@ class TrackedScreen:
 class _Observed:
     """Light of a frame."""
 
-    #: The frame, and where it was read; (C, S, R) light of the strips there, and the columns' own light.
+    #: The frame, and where it was read; (C, S, R) light of the strips there.
     context: FrameContext
     pose: Pose
     light: Float32Array
+    #: The picture as far as it is known before any slot is decided, and the columns' own light by it.
+    picture: PlacedPicture
     columns: ColumnLight
     #: Whether the picture was found to have changed.
     changed: bool = False
