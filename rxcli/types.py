@@ -266,6 +266,11 @@ class Clock:
         out[..., self.first_slot : self.first_slot + self.n_slots] = slots
         return out.reshape(*slots.shape[:-1], self.n_copies, self.packet_slots)
 
+    def by_burst(self, slots: NDArray[Any]) -> NDArray[Any]:
+        """(B, C, packet_slots) grid values (C, N) added over the copies of each burst."""
+        copies = self.to_copies(slots)
+        return np.stack([copies[:, self.burst == burst].sum(axis=1) for burst in range(int(self.burst.max()) + 1)])
+
     def on_grid(self, slots: NDArray[Any]) -> NDArray[Any]:
         """(C, N) values on the grid from values of bursts (B, C, packet_slots)."""
         copies = slots[self.burst].transpose(1, 0, 2)

@@ -91,15 +91,13 @@ def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given
         if scenario.draw != "capture":
             raise click.BadParameter(f"{name} receives no files of yours", param_hint="--over")
         labels = labels_by_field(scenario.points, given["captures"], given["over"])
-        scenario = msgspec.structs.replace(scenario, columns=measures.BY_FIELD)
+        over = {file: scenario.points[file] | {"label": label} for file, label in labels.items()}
+        scenario = msgspec.structs.replace(scenario, points=over, columns=measures.BY_FIELD)
     run = _begin(name, out, given["jobs"], given["quiet"])
     more = {"save": str(given["save"])} if given["save"] else {}
     count = given["count"] or scenario.count
     tasks = scenario.tasks(given["seed"], count, out / "media", cae=given["cae"], **more)
     records = run(tasks, name, alone=scenario.alone)
-    if given["over"]:
-        files = {record["about"]["file"]: record for record in records}
-        records = [{**files[file], "groups": [label]} for file, label in labels.items()]
     rows = measures.rows(records, scenario.ways, scenario.all_columns, scenario.beside)
     odd = measures.worth_a_look(records, scenario.ways)
     click.echo(tables.titled([(scenario.about, rows), *([("worth a look", odd)] if odd else [])]))
@@ -113,7 +111,7 @@ def _run_scenario(context: click.Context, /, journals: tuple[Path, ...], **given
         for weights in details["weights"].values():
             click.echo("likeliest weights of the features: " + " ".join(f"{weight:+.3f}" for weight in weights))
         tables.plot(bins, out / f"{name}-bins.png", "error_free", "interval95", "confidence")
-    points = [row for row in rows if row["scenes"] in scenario.points or (given["over"] and row["scenes"] != "all")]
+    points = [row for row in rows if any(row["scenes"] == task["label"] for task in tasks)]
     for measure in ("ber", "share", "lost_share", "kbps"):
         if points and f"{measure}95" in points[0]:
             tables.plot(points, out / f"{name}-{measure}.png", measure, f"{measure}95")

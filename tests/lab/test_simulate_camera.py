@@ -239,7 +239,7 @@ def test_tone_curves_have_their_standard_values(tone: str, light: float, value: 
 def test_correction_in_the_camera_undoes_the_lens() -> None:
     screen = load_profile("paper-34k6", ScreenProfile)
     view = View(screen, Lens(0.8, COEFFICIENTS[1]), Pose(), 800, 600)
-    x, y = correction_map(view)
+    x, y = np.moveaxis(correction_map(view), -1, 0)
     places = np.stack([x[100, 200], y[100, 200]]).astype(float)
     ideal = view.pixels_to_ideal(places)
     matrix = view.camera_matrix

@@ -18,6 +18,7 @@ from rxcli.lab.benchmark.cases import Record, arguments_of, write_case
 from rxcli.lab.benchmark.draw import DRAWERS, Place
 from rxcli.lab.benchmark.measures import Row
 from rxcli.lab.benchmark.runner import CHECKOUT, Task
+from rxcli.runs.processes import ONE_THREAD
 
 #: What the other process runs: argument lists come on stdin as JSON, records and CPU seconds go to stdout.
 _WORKER = """
@@ -31,11 +32,6 @@ for arguments in jobs[:1] + jobs:  # the first one once more: what is loaded onc
     done.append([printed.getvalue(), time.process_time() - start, int(code)])
 json.dump(done[1:], sys.stdout)
 """
-_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-#: Earlier checkouts remembered cameras from file to file.
-_ENVIRONMENT["VLC_RX_NO_CAMERA_CACHE"] = "1"
-
-
 #: The ways of a comparison; packets of this checkout are compared with those of the other.
 WAYS = ("other checkout", "this checkout")
 COLUMNS = ("n", "same", "packets", "right_packets", "sure", "surely_wrong", "changed", "cpu_s", "cpu_ratio")
@@ -89,7 +85,7 @@ def compare(tasks: Sequence[Task], rival: Path, folder: Path, repeats: int, tick
 
 def _decoded_by(checkout: Path, jobs: Sequence[Sequence[str]]) -> list[Record]:
     """What one checkout made of every file: lines without times, packets, seconds."""
-    environment = {**os.environ, **_ENVIRONMENT, "PYTHONPATH": str(checkout)}
+    environment = {**os.environ, **ONE_THREAD, "PYTHONPATH": str(checkout)}
     command = [sys.executable, "-P", "-c", _WORKER]  # -P: no package of the folder that it is run in
     done = subprocess.run(command, input=json.dumps(jobs), env=environment, capture_output=True, text=True, check=False)
     if done.returncode:

@@ -64,8 +64,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """What is to be done: `count` numbers at every point."""
         shared = {"draw": self.draw, "ways": self.ways, "seed": seed, "folder": str(folder), "cae": None, **more}
         return [
-            {**shared, "number": number, "label": label, "point": {**self.base, **point}}
-            for label, point in self.points.items()
+            {**shared, "number": number, "label": point.get("label", name), "point": {**self.base, **point}}
+            for name, point in self.points.items()
             for number in range(count)
         ]
 

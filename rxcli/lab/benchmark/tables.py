@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -69,7 +69,7 @@ def titled(sections: Iterable[tuple[str, Sequence[Row]]]) -> str:
 
 
 def plot(rows: Sequence[Row], path: Path, measure: str, interval: str, across: str = "scenes") -> None:
-    """Draw one measure of a table with its intervals, a line for each way; nothing where matplotlib is not installed.
+    """Draw one measure of a table with its intervals, a line for each way.
 
     Args:
         rows: the table.
@@ -78,55 +78,55 @@ def plot(rows: Sequence[Row], path: Path, measure: str, interval: str, across: s
         interval: the column of its intervals.
         across: the column along the other axis.
     """
-    if not _can_plot():
-        return
-    from matplotlib.figure import Figure
-
     names = list(dict.fromkeys(row[across] for row in rows))
-    figure = Figure(figsize=(max(6.4, 0.7 * len(names)), 4.8), layout="constrained")
-    axes = figure.subplots()
-    for number, way in enumerate(dict.fromkeys(row.get("way") for row in rows)):
-        mine = [row for row in rows if row.get("way") == way and row[measure] is not None]
-        # Lines step aside a little, lest their intervals cover each other.
-        x = [names.index(row[across]) + 0.05 * number for row in mine]
-        axes.plot(x, [row[measure] for row in mine], "o-", color=f"C{number}", label=way or measure)
-        axes.vlines(x, *([row[interval][end] for row in mine] for end in (0, 1)), color=f"C{number}")
-    axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
-    if measure == "ber":
-        axes.set_yscale("symlog", linthresh=1e-5)
-    axes.set(ylabel=measure, ylim=(0, None if measure == "kbps" else 1))
-    axes.legend(fontsize=8)
-    figure.savefig(path, dpi=130)
+
+    def draw(axes: Any) -> None:
+        for number, way in enumerate(dict.fromkeys(row.get("way") for row in rows)):
+            mine = [row for row in rows if row.get("way") == way and row[measure] is not None]
+            # Lines step aside a little, lest their intervals cover each other.
+            x = [names.index(row[across]) + 0.05 * number for row in mine]
+            axes.plot(x, [row[measure] for row in mine], "o-", color=f"C{number}", label=way or measure)
+            axes.vlines(x, *([row[interval][end] for row in mine] for end in (0, 1)), color=f"C{number}")
+        axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
+        if measure == "ber":
+            axes.set_yscale("symlog", linthresh=1e-5)
+        axes.set(ylabel=measure, ylim=(0, None if measure == "kbps" else 1))
+
+    draw_figure(draw, path, width=max(6.4, 0.7 * len(names)))
 
 
 def plot_error_over_time(points: Mapping[str, Sequence[tuple[float, float]]], stem: Path) -> list[Path]:
-    """Draw bit error rate against run time as PNG and SVG; returns where, nothing where matplotlib is not installed.
+    """Draw bit error rate against run time as PNG and SVG; returns where.
 
     Args:
         points: way -> seconds and bit error rate of every file; a large mark stands for their means.
         stem: path without suffix.
     """
-    if not _can_plot():
+
+    def draw(axes: Any) -> None:
+        for number, (way, found) in enumerate(points.items()):
+            seconds, rates = zip(*found, strict=True)
+            mean = sum(seconds) / len(found), sum(rates) / len(found)
+            axes.plot(seconds, rates, ".", color=f"C{number}", alpha=0.5)
+            axes.plot(*mean, "o", color=f"C{number}", markersize=11, label=f"{way}, mean of all files")
+        axes.set_xscale("log")
+        axes.set_yscale("symlog", linthresh=1e-4)
+        axes.set(xlabel="processor time of a file, s", ylabel="bit error rate, lost packets included", ylim=(-2e-5, 1))
+
+    return draw_figure(draw, *(stem.with_name(stem.name + suffix) for suffix in (".png", ".svg")))
+
+
+def draw_figure(draw: Callable[[Any], None], *paths: Path, width: float = 6.4) -> list[Path]:
+    """Have `draw` fill the axes of a figure, write it to `paths`; returns where, nothing without matplotlib."""
+    if find_spec("matplotlib") is None:
+        log.warning("no plots: matplotlib is not installed (pip install matplotlib)")
         return []
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(6.4, 4.8), layout="constrained")
+    figure = Figure(figsize=(width, 4.8), layout="constrained")
     axes = figure.subplots()
-    for number, (way, found) in enumerate(points.items()):
-        seconds, rates = zip(*found, strict=True)
-        axes.plot(seconds, rates, ".", color=f"C{number}", alpha=0.5)
-        axes.plot(sum(seconds) / len(found), sum(rates) / len(found), "o", color=f"C{number}", markersize=11, label=way)
-    axes.set_xscale("log")
-    axes.set_yscale("symlog", linthresh=1e-4)
-    axes.set(xlabel="processor time of a file, s", ylabel="bit error rate, lost packets included", ylim=(-2e-5, 1))
-    axes.legend(fontsize=8, title="mean of all files")
-    paths = [stem.with_name(stem.name + suffix) for suffix in (".png", ".svg")]
+    draw(axes)
+    axes.legend(fontsize=8)
     for path in paths:
         figure.savefig(path, dpi=130)
-    return paths
-
-
-def _can_plot() -> bool:
-    if find_spec("matplotlib") is None:
-        log.warning("no plots: matplotlib is not installed (pip install matplotlib)")
-    return find_spec("matplotlib") is not None
+    return list(paths)

@@ -105,6 +105,4 @@ class OracleRecorder:
 def _cells(values: NDArray[np.floating], pitch: int) -> FloatArray:
     """Sums over cells of `pitch` pixels across (and over colours); (rows, cells)."""
     flat = values if values.ndim == 2 else values.sum(axis=2)
-    missing = -flat.shape[1] % pitch
-    padded = np.pad(flat, ((0, 0), (0, missing))).astype(np.float64)
-    return np.asarray(padded.reshape(flat.shape[0], -1, pitch).sum(axis=2))
+    return np.asarray(np.add.reduceat(flat.astype(np.float64), np.arange(0, flat.shape[1], pitch), axis=1))

@@ -26,6 +26,8 @@ from rxcli.lab.simulate.transmitter import Drive, Link, light_spread
 #: Pitch of the coarse grid in rows, and rows of one band of work (a multiple of it).
 _GRID_ROWS = 32
 _BAND_ROWS = 256
+#: Pitch of the nodes between which places in the texture are interpolated.
+_PLACES_PITCH = 16
 #: Texture pixels of black around the panel, so that blur can run out of it.
 _TEXTURE_MARGIN = 12
 #: Rounds after which a place of the screen is on the row that is read when it is there.
@@ -98,22 +100,22 @@ class Exposure:
         """Time of the clip in the middle of the exposure of rows."""
         return self.start_s + rows * self.scene.sensor.line_delay_s + self.scene.exposure_s / 2
 
-    def panel(self, x: Float32Array, y: Float32Array, top: int) -> list[Float32Array]:
-        """For each kind of light (rows, width, 3) texture at places of it (rows, width), of rows from `top` on."""
+    def panel(self, places: Float32Array, top: int) -> list[Float32Array]:
+        """For each kind of light (rows, width, 3) texture at places of it (rows, width, 2), of rows from `top` on."""
 
         def at_places(textures: tuple[Float32Array, ...]) -> list[Float32Array]:
             flags: dict[str, int] = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_CONSTANT}
-            return [np.asarray(cv2.remap(texture, x, y, **flags)) for texture in textures]
+            return [np.asarray(cv2.remap(texture, places, None, **flags)) for texture in textures]
 
         if self.player is None:
             return at_places(self.textures[0][0])
         lines = self.drive.grey.shape[0] * self.texture_scale[0]
-        height = np.clip((y + 0.5 - _TEXTURE_MARGIN) / lines, 0, 1)
-        middles_s = self._middles_s(top + np.arange(len(y), dtype=np.float64))
+        height = np.clip((places[..., 1] + 0.5 - _TEXTURE_MARGIN) / lines, 0, 1)
+        middles_s = self._middles_s(top + np.arange(len(places), dtype=np.float64))
         begun = self.player.refreshes(middles_s[:, None], height)
         number = np.clip(np.floor(begun), self.refreshes[0], self.refreshes[-1])
         old = np.exp((number - begun) / (self.scene.film.refresh_hz * self.scene.film.response_s)).astype(np.float32)
-        images = [np.zeros((*y.shape, 3), np.float32) for _ in self.decays]
+        images = [np.zeros((*height.shape, 3), np.float32) for _ in self.decays]
         for refresh, textures in zip(self.refreshes, self.textures, strict=True):
             if (here := number == refresh).any():
                 for image, new, before in zip(images, *map(at_places, textures), strict=True):
@@ -299,21 +301,14 @@ class Band:
 def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
     """Expected light of the sensor rows `top` to `bottom`."""
     sensor, pitch = exposure.scene.sensor, exposure.grid_pitch
-    places = _texture_places(exposure, top, bottom)
-    pictures = tuple(pick_colours(picture, sensor.pattern, top) for picture in exposure.panel(*places, top))
+    x, y = grid_nodes(sensor.width, _PLACES_PITCH), grid_nodes(bottom - top, _PLACES_PITCH) + top
+    places = between_nodes(_in_texture(exposure, x, y), _PLACES_PITCH, bottom - top, sensor.width)
+    pictures = tuple(pick_colours(picture, sensor.pattern, top) for picture in exposure.panel(places, top))
     backlights = []
     for nodes in _backlight_nodes(exposure, grid_nodes(sensor.width, pitch), top, bottom):
         light = cv2.resize(nodes, (nodes.shape[1] * pitch, nodes.shape[0]), interpolation=cv2.INTER_LINEAR)
         backlights.append(np.ascontiguousarray(light[:, pitch : pitch + sensor.width], np.float32))
     return Band(top, pictures, tuple(backlights), _other_light(exposure, top, bottom))
-
-
-def _texture_places(exposure: Exposure, top: int, bottom: int) -> tuple[Float32Array, Float32Array]:
-    """The place (x, y) of every pixel in the texture, interpolated between nodes."""
-    pitch = 16
-    x, y = grid_nodes(exposure.scene.sensor.width, pitch), grid_nodes(bottom - top, pitch) + top
-    inner = between_nodes(_in_texture(exposure, x, y), pitch, bottom - top, exposure.scene.sensor.width)
-    return np.ascontiguousarray(inner[..., 0]), np.ascontiguousarray(inner[..., 1])
 
 
 def _in_texture(exposure: Exposure, x: FloatArray, y: FloatArray) -> Float32Array:

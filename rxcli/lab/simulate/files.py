@@ -85,14 +85,8 @@ def _append_exif(path: Path, scene: Scene) -> None:
 
 def pack_14bit(values: NDArray[np.uint16]) -> bytes:
     """Rows of 14-bit numbers, most significant bit first, each row padded to whole bytes."""
-    height, width = values.shape
-    padded = np.zeros((height, -(-width // 4) * 4), np.uint64)
-    padded[:, :width] = values
-    quads = padded.reshape(height, -1, 4)
-    word = (quads[..., 0] << np.uint64(42)) | (quads[..., 1] << np.uint64(28)) | (quads[..., 2] << np.uint64(14))
-    word |= quads[..., 3]
-    packed = word.astype(">u8").view(np.uint8).reshape(height, -1, 8)[..., 1:].reshape(height, -1)
-    return bytes(packed[:, : -(-width * 14 // 8)].tobytes())
+    bits = np.unpackbits(values.astype(">u2")[..., None].view(np.uint8), axis=-1)[..., 2:]
+    return np.packbits(bits.reshape(len(values), -1), axis=-1).tobytes()
 
 
 def write_dng(raw: NDArray[np.uint16], scene: Scene, path: Path, bits: int = 16) -> None:

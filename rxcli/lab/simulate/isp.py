@@ -184,20 +184,18 @@ def _reduce_noise(planes: Float32Array, isp: Isp) -> Float32Array:
     return np.asarray(colour, np.float32)
 
 
-def correction_map(view: View) -> tuple[Float32Array, Float32Array]:
-    """Sensor places (x, y) that the pixels of a corrected picture are taken from; each (height, width) float32."""
+def correction_map(view: View) -> Float32Array:
+    """(height, width, 2) float32 sensor places (x, y) that the pixels of a corrected picture are taken from."""
     pitch = 16
     x, y = grid_nodes(view.width, pitch), grid_nodes(view.height, pitch)
     matrix = view.camera_matrix
     ideal = (np.stack(np.meshgrid(x, y), axis=-1) - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
-    nodes = view.ideal_to_pixels(ideal).astype(np.float32)
-    inner = between_nodes(nodes, pitch, view.height, view.width)
-    return np.ascontiguousarray(inner[..., 0]), np.ascontiguousarray(inner[..., 1])
+    return between_nodes(view.ideal_to_pixels(ideal).astype(np.float32), pitch, view.height, view.width)
 
 
 def correct_distortion(planes: Float32Array, view: View) -> Float32Array:
     """A picture without the lens's distortion, on the same camera matrix."""
-    return np.asarray(cv2.remap(planes, *correction_map(view), cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+    return np.asarray(cv2.remap(planes, correction_map(view), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
 
 
 def luma(rgb: NDArray[Any]) -> Float32Array:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,7 +18,6 @@ _FILES = (
     *("motorcycle_left.png", "page.png", "retina.jpg", "rocket.jpg"),
 )
 PHOTOS = {re.split("[._]", file)[0]: file for file in _FILES}
-GENERATED = ("white", "grey", "sky", "gradient", "bars", "noise", "checker", "text", "flower", "night", "black")
 
 
 def draw_name(rng: np.random.Generator) -> str:
@@ -27,7 +27,7 @@ def draw_name(rng: np.random.Generator) -> str:
 
 def picture_names() -> tuple[str, ...]:
     """Names that `load_picture` knows."""
-    return (*PHOTOS, *GENERATED)
+    return (*PHOTOS, *_GENERATED)
 
 
 def load_picture(name: str, width: int, height: int) -> Picture:
@@ -45,7 +45,7 @@ def load_picture(name: str, width: int, height: int) -> Picture:
         UsageError: no such name or file.
         InputError: a file that is no picture.
     """
-    if name in GENERATED:
+    if name in _GENERATED:
         return _generate(name, width, height)
     path = _photo_path(name) if name in PHOTOS else Path(name)
     return _fill(_read(path), width, height)
@@ -83,19 +83,7 @@ def _fill(picture: Picture, width: int, height: int) -> Picture:
 
 def _generate(name: str, width: int, height: int) -> Picture:
     y, x = np.mgrid[0:height, 0:width]
-    u, v = (x + 0.5) / width, (y + 0.5) / height
-    flat = {"white": 1.0, "grey": 0.5, "black": 0.0}
-    drawers: dict[str, Callable[[], NDArray[np.float64]]] = {
-        "sky": lambda: _sky(u, v),
-        "gradient": lambda: 0.1 + 0.45 * (u + v),
-        "bars": lambda: _bars(u),
-        "noise": lambda: np.random.default_rng(7).uniform(0, 1, (height, width, 3)),
-        "checker": lambda: 0.15 + 0.8 * ((np.floor(28 * u) + np.floor(16 * v)) % 2),
-        "text": lambda: _text(width, height),
-        "flower": lambda: _flower(u * width / height, v, width / height),
-        "night": lambda: _night(u, v),
-    }
-    drawn = np.full(u.shape, flat[name]) if name in flat else drawers[name]()
+    drawn = _GENERATED[name]((x + 0.5) / width, (y + 0.5) / height)
     rgb = np.broadcast_to(np.atleast_3d(drawn), (height, width, 3))
     return np.asarray(np.rint(255 * np.clip(rgb, 0, 1)), np.uint8)
 
@@ -111,19 +99,19 @@ def _bars(u: NDArray[np.float64]) -> NDArray[np.float64]:
     return 0.75 * np.stack([~index & 1, ~(index >> 1) & 1, ~(index >> 2) & 1], axis=-1) + 0.1
 
 
-def _text(width: int, height: int) -> NDArray[np.float64]:
-    page = np.full((height, width), 238, np.uint8)
+def _text(u: NDArray[np.float64], _v: NDArray[np.float64]) -> NDArray[np.float64]:
+    page = np.full(u.shape, 238, np.uint8)
     lines = (
         "The quick brown fox jumps over the lazy dog 0123456789",
         "Light is sent by columns, time is told by rows.",
     )
-    for i, top in enumerate(range(30, height, 28)):
+    for i, top in enumerate(range(30, len(page), 28)):
         cv2.putText(page, f"{i:02d} {lines[i % 2]} {lines[(i + 1) % 2]}", (16, top), 0, 0.62, 25, 1, cv2.LINE_AA)
     return page / 255.0
 
 
-def _flower(x: NDArray[np.float64], y: NDArray[np.float64], aspect: float) -> NDArray[np.float64]:
-    dx, dy = x - 0.5 * aspect, y - 0.5
+def _flower(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    dx, dy = (u - 0.5) * u.shape[1] / u.shape[0], v - 0.5
     radius, angle = np.hypot(dx, dy), np.arctan2(dy, dx)
     petals = 0.28 + 0.16 * np.cos(6 * angle)
     inside = 1 / (1 + np.exp((radius - petals) * 60))
@@ -139,6 +127,22 @@ def _night(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64
     windows = ((np.sin(u * 190) > 0.8) & (np.sin(v * 120) > 0.7) & (v > 0.65)) * 0.6
     base = 0.015 + 0.03 * v
     return np.stack([base + moon + windows, base + moon + 0.8 * windows, 1.6 * base + moon + 0.3 * windows], axis=-1)
+
+
+#: Name of a generated picture -> its values 0..1 at places 0..1 across and down.
+_GENERATED: dict[str, Callable[[NDArray[np.float64], NDArray[np.float64]], Any]] = {
+    "white": lambda u, v: 1.0,
+    "grey": lambda u, v: 0.5,
+    "sky": _sky,
+    "gradient": lambda u, v: 0.1 + 0.45 * (u + v),
+    "bars": lambda u, v: _bars(u),
+    "noise": lambda u, v: np.random.default_rng(7).uniform(0, 1, (*u.shape, 3)),
+    "checker": lambda u, v: 0.15 + 0.8 * ((np.floor(28 * u) + np.floor(16 * v)) % 2),
+    "text": _text,
+    "flower": _flower,
+    "night": _night,
+    "black": lambda u, v: 0.0,
+}
 
 
 # Random pictures that are mostly black: films with bars, windows on dark desktops, night, stars. They hide

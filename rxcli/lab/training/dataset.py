@@ -138,7 +138,7 @@ def sample_of(
         weights: (C,) what was sent.
     """
     clock = scene.clock
-    lit, dark = (_by_packet(part, clock) for part in (slots[columns], 1 - slots[columns]))
+    lit, dark = (clock.by_burst(part.astype(np.int64)) for part in (slots[columns], 1 - slots[columns]))
     if (lit * dark).any():
         return None
     bursts = by_burst(scene.metrics[columns], clock)
@@ -162,12 +162,6 @@ def sample_of(
         scores=np.stack(scores).reshape(*shape, MAX_WORDS),
         words=np.stack(words).reshape(shape),
     )
-
-
-def _by_packet(slots: NDArray[np.uint8], clock: Clock) -> NDArray[np.int64]:
-    """(bursts, B, packet) slots (B, N) of the grid added over the copies of each burst."""
-    copies = clock.to_copies(slots.astype(np.int64))
-    return np.stack([copies[:, clock.burst == burst].sum(axis=1) for burst in range(int(clock.burst.max()) + 1)])
 
 
 def _payload(packet: NDArray[np.integer]) -> NDArray[np.int64]:

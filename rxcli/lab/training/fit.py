@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from rxcli.errors import InputError
+from rxcli.lab.benchmark.tables import draw_figure
 from rxcli.lab.training.dataset import MAX_WORDS, UNKNOWN, Sample
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 from rxcli.receiver.channel.denoise import N_COLUMN_FEATURES, N_STRIP_FEATURES
@@ -250,13 +251,11 @@ def mean_loss(network: StripNetwork, samples: Sequence[Sample]) -> float:
 
 def _plot_loss(history: Sequence[tuple[int, float, float]], path: Path) -> None:
     """Training and validation loss over the steps, as a picture."""
-    from matplotlib.figure import Figure
-
     steps, *losses = np.array(history, np.float64).T
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.subplots()
-    for label, values in zip(("training", "validation"), losses, strict=True):
-        axes.plot(steps, values, label=label)
-    axes.set(xlabel="step", ylabel="cross-entropy of a word", yscale="log")
-    axes.legend()
-    figure.savefig(path, dpi=110)
+
+    def draw(axes: Any) -> None:
+        for label, values in zip(("training", "validation"), losses, strict=True):
+            axes.plot(steps, values, label=label)
+        axes.set(xlabel="step", ylabel="cross-entropy of a word", yscale="log")
+
+    draw_figure(draw, path)

@@ -255,8 +255,7 @@ def slots_observed(samples: SlotSamples, clock: Clock) -> IntArray:
     """(B, C, packet) number of copies in which the middle of each slot is on the screen and in the picture."""
     q = samples.samples_per_slot
     shown = samples.valid[..., q // 2 :: q].max(axis=1) > 0
-    by_copy = clock.to_copies(shown.astype(np.int64))
-    return np.stack([by_copy[:, clock.burst == burst].sum(axis=1) for burst in range(int(clock.burst.max()) + 1)])
+    return clock.by_burst(shown.astype(np.int64))
 
 
 def in_view(n_observed: IntArray, max_missing: int = 0) -> BoolArray:
