@@ -93,8 +93,9 @@ class UsageError(ReceiverError):
 
 
 def reason_of(error: BaseException) -> str:
-    """Message of an exception in one short line; of one of the system its text alone."""
-    text = getattr(error, "strerror", None) or " ".join(str(part) for part in error.args) or type(error).__name__
+    """Message of an exception in one short line; of one of the system its text alone. LibRaw's are bytes."""
+    parts = (part.decode("ascii", "replace") if isinstance(part, bytes) else str(part) for part in error.args)
+    text = getattr(error, "strerror", None) or " ".join(parts) or type(error).__name__
     return " ".join(str(text).split())[:160]
 
 

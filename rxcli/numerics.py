@@ -23,13 +23,11 @@ _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]
 
 @lru_cache(maxsize=1)
 def _blas() -> Any:
-    """Controller of the threads of matrix products; None where there is one anyway, or no threadpoolctl."""
+    """Controller of the threads of matrix products; None where there is one anyway."""
     if os.environ.get("OPENBLAS_NUM_THREADS") == "1" and "openblas" in str(np.show_config(mode="dicts")):
         return None
-    try:
-        from threadpoolctl import ThreadpoolController
-    except ImportError:
-        return None
+    from threadpoolctl import ThreadpoolController
+
     return ThreadpoolController()
 
 

@@ -111,16 +111,14 @@ def receiver_options(
         cameras=_profiles(named, CameraProfile),
         force_camera=len(named) == 1 and named[0] != AUTO,
         corners=None if corners is None else _checked_corners(corners),
-        mirrored=mirrored,
         cae=cae,
         min_confidence=min_confidence,
         skip=frozenset(SKIPS) - set(names),
-        stop_when_certain=stop_when_certain,
         denoiser=denoiser,
         # Absolute, since workers may run in other folders.
         dump_dir=None if dump_dir is None else Path(dump_dir).absolute(),
-        soft_bits=soft_bits,
         file_memory_mb=file_memory_mb,
+        **flags,
     )
 
 

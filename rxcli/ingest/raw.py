@@ -49,7 +49,7 @@ def read_raw(path: Path) -> Frame:
     except rawpy.LibRawFileUnsupportedError:
         raise InputError(*_unsupported(path)) from None
     except (rawpy.LibRawError, RuntimeError, OSError, MemoryError, ValueError) as error:
-        reason = f"{path}: the RAW file is damaged or cut ({_libraw_reason(error)})"
+        reason = f"{path}: the RAW file is damaged or cut ({reason_of(error)})"
         raise InputError(reason, "copy the file again") from None
     top, left, height, width = default_crop(raw.sizes)
     pixels = image[top : top + height, left : left + width]
@@ -170,9 +170,3 @@ def _metadata(path: Path, raw: Any) -> Metadata:
     )
     orientation = exif.orientation if exif.orientation != 1 else _FLIP_ORIENTATION.get(raw.sizes.flip, 1)
     return replace(merge(exif, believed(libraw)), orientation=orientation)
-
-
-def _libraw_reason(error: BaseException) -> str:
-    """Error message of LibRaw, which comes as bytes."""
-    detail = error.args[0] if error.args else ""
-    return detail.decode("ascii", "replace") if isinstance(detail, bytes) else reason_of(error)

@@ -25,10 +25,9 @@ import videodev2 as api
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError
+from rxcli.ingest.luma import Luma
 from rxcli.ingest.times import FrameTimes
 from rxcli.types import Frame, Metadata
-
-Luma = NDArray[np.uint8] | NDArray[np.uint16]
 
 _CAPTURE, _MAPPED = api.V4L2_BUF_TYPE_VIDEO_CAPTURE, api.V4L2_MEMORY_MMAP
 #: Buffers in several planes, as those of cameras on phones and boards are, and how many at most.
@@ -446,9 +445,8 @@ def _choose(modes: list[Mode], settings: CameraSettings, path: Path) -> Mode:
     Raises:
         InputError: there is none; the message lists the available modes.
     """
-    fitting = [mode for mode in modes if settings.pixel_format in (None, mode.pixel_format)]
-    fitting = [mode for mode in fitting if settings.width in (None, mode.width)]
-    fitting = [mode for mode in fitting if settings.height in (None, mode.height)]
+    asked_for = [(name, getattr(settings, name)) for name in ("pixel_format", "width", "height")]
+    fitting = [mode for mode in modes if all(value in (None, getattr(mode, name)) for name, value in asked_for)]
     if fitting:
         return max(fitting, key=partial(_merit, fps=settings.fps))
     if not modes:

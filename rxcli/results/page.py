@@ -18,7 +18,7 @@ from rxcli.results.inspection import Inspection, Trace, inspect_frame
 from rxcli.results.maps import column_map
 from rxcli.results.overlay import picture_of, preview
 from rxcli.results.record import plain
-from rxcli.results.report import count_packets, headline, mirror_note, plural
+from rxcli.results.report import headline, mirror_note, packets_in_words, plural
 from rxcli.types import FloatArray, Frame, FrameResult
 
 #: First lines of a page that this program wrote.
@@ -51,10 +51,8 @@ def inspection_page(
     reason, advice = split_message(result) if result.message else ("", "")
     title, frame_note = headline(result), ""
     if timeline:  # a clip is headed by what all its frames gave
-        packets = [packet for entry in timeline for packet in entry.packets]
-        n_received = sum(packet.is_believable for packet in packets)
         frame_note = f"Frame {result.frame} is shown: {title.lower()}."
-        counted = count_packets(n_received, len(packets) - n_received)
+        counted = packets_in_words([packet for entry in timeline for packet in entry.packets])
         title = capitalised(f"{counted}, {plural(len(timeline), 'frame')}")
     data = {
         "headline": title,

@@ -4,7 +4,7 @@ import csv
 import io
 import math
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 from rxcli.errors import capitalised, printable
 from rxcli.results.columns import PACKET_TABLE, PAYLOAD_TABLE, packet_rows
 from rxcli.results.record import plain
-from rxcli.types import FrameResult, ObjectProgress, ReceivedObject
+from rxcli.types import FrameResult, ObjectProgress, PacketResult, ReceivedObject
 
 #: Hex digits of a payload that a table of 80 characters shows.
 _SHOWN_DIGITS = 20
@@ -134,17 +134,18 @@ def format_heading(result: FrameResult) -> str:
 def _counts(result: FrameResult) -> str:
     if _goes_on(result):
         return "its packets end in later frames"
-    return f"{_packets_in_words(result)} ({plural(len(result.columns), 'column')})"
+    return f"{packets_in_words(result.packets)} ({plural(len(result.columns), 'column')})"
 
 
-def _packets_in_words(result: FrameResult) -> str:
-    n_received = sum(packet.is_believable for packet in result.packets)
-    return count_packets(n_received, len(result.packets) - n_received)
+def packets_in_words(packets: Sequence[PacketResult]) -> str:
+    """Packets, unsure ones apart; see `count_packets`."""
+    n_received = sum(packet.is_believable for packet in packets)
+    return count_packets(n_received, len(packets) - n_received)
 
 
 def headline(result: FrameResult) -> str:
     """What became of a frame, in a few words."""
-    return capitalised(_packets_in_words(result)) if result.packets else _STATUS[result.status]
+    return capitalised(packets_in_words(result.packets)) if result.packets else _STATUS[result.status]
 
 
 def count_packets(n_received: int, n_unsure: int) -> str:

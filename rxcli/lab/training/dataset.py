@@ -77,18 +77,17 @@ def frame_samples(n_frames: int, seed: int, folder: Path, *, progress: bool = Tr
 
 
 def validation_samples(n_frames: int, folder: Path, *, progress: bool = True) -> list[Sample]:
-    """Samples of the first validation frames."""
-    return list(_cached(validation_sample, n_frames, folder / "validation", "validation", progress))
+    """Samples of pictures and cameras not trained on, all scene classes in turn.
 
-
-def validation_sample(number: int) -> Sample | None:
-    """Sample of a picture and a camera not trained on, all scene classes in turn, or None.
-
-    It holds columns that the receiver uses the network for; training also uses hopeless ones.
+    They hold columns that the receiver uses the network for; training also uses hopeless ones.
     """
-    kind, turn = SCENE_CLASSES[number % len(SCENE_CLASSES)], number // len(SCENE_CLASSES)
-    scene = validation_scene(kind, _SCREENS[turn % 2], turn // 2)
-    return _simulated(scene, _VALIDATION + number)
+
+    def make(number: int) -> Sample | None:
+        turn, kind = divmod(number, len(SCENE_CLASSES))
+        scene = validation_scene(SCENE_CLASSES[kind], _SCREENS[turn % 2], turn // 2)
+        return _simulated(scene, _VALIDATION + number)
+
+    return list(_cached(make, n_frames, folder / "validation", "validation", progress))
 
 
 def _cached(make: Callable[[int], Sample | None], n: int, folder: Path, what: str, progress: bool) -> Iterator[Sample]:
