@@ -115,9 +115,17 @@ def test_copies_with_little_in_common_are_assigned_by_their_joint_evidence(copie
     assert np.mean((found.clock.on_grid(found.posteriors.lit) > 0.5) != (sent > 0.5)) < 0.06
 
 
-@pytest.mark.parametrize(("lit", "expected"), [(slice(4, 8), [3, 4, 5, 6]), (slice(0, 3), [1, 2, 3, 4])])
-def test_the_brighter_half_of_the_columns_leaves_out_the_outermost(lit: slice, expected: list[int]) -> None:
-    light = np.full((8, STRIPS, 30), 0.1)
+@pytest.mark.parametrize(
+    ("n_columns", "lit", "expected"),
+    [
+        (8, slice(4, 8), range(3, 7)),
+        (8, slice(0, 3), range(1, 5)),
+        (100, slice(50, 60), range(50, 60)),  # ten rank a hypothesis as well as fifty
+    ],
+)
+def test_the_brighter_half_of_the_columns_leaves_out_the_outermost(n_columns: int, lit: slice, expected: range) -> None:
+    light = np.full((n_columns, STRIPS, 30), 0.1)
     light[lit] = 1.0
-    screen = structs.replace(load_profile("paper-8k65", ScreenProfile), columns=8)
-    assert Acquisition(screen, profiles_of(light), clock_of(8), (screen,)).bright_columns.tolist() == expected
+    screen = structs.replace(load_profile("paper-8k65", ScreenProfile), columns=n_columns)
+    acquisition = Acquisition(screen, profiles_of(light), clock_of(n_columns), (screen,))
+    assert acquisition.bright_columns.tolist() == list(expected)

@@ -13,6 +13,9 @@ from rxcli.receiver.light import MIN_VARIANCE
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Clock, IntArray, RowProfiles
 
+#: Columns that are enough to rank a hypothesis.
+_MAX_BRIGHT = 10
+
 
 @dataclass(frozen=True)
 class Acquisition:
@@ -41,9 +44,9 @@ class Acquisition:
 
     @cached_property
     def bright_columns(self) -> IntArray:
-        """Numbers of the half of the columns, side by side and without the outermost, that has the most light."""
+        """Numbers of half of the columns, ten at most, side by side and without the outermost: those of most light."""
         profiles, n_columns = self.profiles, self.screen.columns
-        n, start = n_columns - 2 * (n_columns // 4), min(n_columns // 4, 1)
+        n, start = min(n_columns - 2 * (n_columns // 4), _MAX_BRIGHT), min(n_columns // 4, 1)
         n_inside = np.maximum(profiles.inside.sum(axis=(1, 2)), 1)
         light = np.append(0.0, np.cumsum((profiles.light * profiles.inside).sum(axis=(1, 2)) / n_inside))
         light = light[start : n_columns - start + 1]

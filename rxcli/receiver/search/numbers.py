@@ -41,11 +41,11 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
         nearest = min(rivals, key=lambda index: abs(shifts[index]))
         moved = replace(best.hypothesis, outline=outlines[nearest], camera=best.context.camera)
         profiles, n = proposer.context(moved).sample_columns(n_columns), shifts[nearest]
-        reread = replace(acquisition, profiles=profiles)
-        gain = _outer_evidence(reread, -n) - _outer_evidence(acquisition, n)
+        gained = _outer_evidence(replace(acquisition, profiles=profiles), -n)
         for index in rivals:
-            further = own_llr[slice(*sorted((n, shifts[index])))]
-            log_odds = outlines[index].log_odds + SETTINGS.outer_weight * min(gain - float(further.sum()), 0.0)
+            shift = shifts[index]
+            lost = float((own_llr[:shift] if shift > 0 else own_llr[shift:]).sum())
+            log_odds = outlines[index].log_odds + SETTINGS.outer_weight * min(gained - lost, 0.0)
             out[index] = replace(outlines[index], log_odds=log_odds)
     return out
 

@@ -141,7 +141,7 @@ class Proposer:
             if same_clock and candidate.family != outline.family:
                 change = SETTINGS.temper * (candidate.log_odds - outline.log_odds)
                 yield self._hypothesis(candidate, camera, nearest_screen(same_clock, n_columns), log_prior + change)
-        if camera.hypothesis is not None and scored.reception.is_long:
+        if camera.hypothesis is not None and scored.reception.is_long and scored.evidence < SETTINGS.plain:
             # What long exposures leave of a packet fits either way to some extent.
             other_way = replace(camera.hypothesis, reversed=not camera.reversed, number=-1 - camera.hypothesis.number)
             back = estimated_camera(other_way, hypothesis.screen.slot_rate_hz, self.cache.frame)

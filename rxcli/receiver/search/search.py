@@ -248,13 +248,11 @@ class _Walk:
         best, acquisition = self._best(), _acquired(hypothesis)
         # Joint detection takes long.
         is_long = acquisition.clock.exposure_slots > LONG_EXPOSURE_SLOTS
-        is_costly = is_long and hypothesis.camera.hypothesis is not None
         if is_long and self._n_in_vain >= SETTINGS.doubtful_budget:
             return
-        if best is not None or is_costly:
+        if best is not None or is_long:
             half = self._measured(hypothesis, acquisition.of_columns(acquisition.bright_columns))
-            # Without packets an estimated camera is rejected.
-            min_evidence = SETTINGS.few_packets if is_costly else PASSES.min_packets_llr
+            min_evidence = SETTINGS.few_packets if is_long else PASSES.min_packets_llr
             min_score, lead = -np.inf, 0.0
             if best is not None:
                 lead = evidence.bright_score(best) - best.score if best.evidence > PASSES.min_packets_llr else 0.0

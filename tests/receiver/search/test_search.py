@@ -197,8 +197,10 @@ def test_hypotheses_are_measured_on_their_bright_columns_first(
     assert own == measured
 
 
-@pytest.mark.parametrize("is_long", [True, False])
-def test_a_long_exposure_is_also_read_the_other_way_round(is_long: bool) -> None:
+@pytest.mark.parametrize(
+    ("is_long", "evidence", "asks"), [(True, 300.0, True), (True, 500.0, False), (False, 300.0, False)]
+)
+def test_a_long_exposure_is_also_read_the_other_way_round(is_long: bool, evidence: float, asks: bool) -> None:
     trial = trial_of("paper-17k3")
     proposer = Proposer(FrameCache(trial.frame), ReceiverOptions(cameras=()), (Outline(trial.corners),))
     own = next(proposer.cameras())[0]
@@ -206,10 +208,10 @@ def test_a_long_exposure_is_also_read_the_other_way_round(is_long: bool) -> None
         hypothesis=own,
         context=SimpleNamespace(camera=own.camera),
         reception=SimpleNamespace(is_long=is_long),
-        evidence=500.0,
+        evidence=evidence,
     )
     back = [sibling for sibling in proposer.siblings(scored) if sibling.camera.reversed != own.camera.reversed]
-    assert [sibling.identity != own.identity for sibling in back] == [True] * is_long
+    assert [sibling.identity != own.identity for sibling in back] == [True] * asks
 
 
 def test_every_hypothesis_is_recorded_with_its_fate(tmp_path: Path) -> None:
