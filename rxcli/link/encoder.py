@@ -21,7 +21,7 @@ from rxcli.link.layout import (
     announcement_layout,
     beacon_layout,
 )
-from rxcli.protocol import HEADER, bits_per_symbol, bits_to_hex, bits_to_indices, codebook, dimming_symbol
+from rxcli.protocol import HEADER, bits_per_symbol, bits_to_hex, bits_to_indices, codebook, dimming_symbol, payload_bits
 from rxcli.types import MessageKind
 
 #: Information at which one photo suffices for a beacon, relative to its bits.
@@ -196,13 +196,14 @@ class RawSending:
         """(n, N, C) uint8 labels of bursts `bursts` (n,)."""
         out = np.empty((len(bursts), payload_symbols, columns), np.uint8)
         for place, burst in enumerate(bursts.tolist()):
-            for column, (bits, w) in enumerate(zip(self._payload(burst, payload_symbols), self._w(burst), strict=True)):
+            weights = self.weights[burst % len(self.weights)].tolist()
+            for column, (bits, w) in enumerate(zip(self._payload(burst, payload_symbols), weights, strict=True)):
                 out[place, :, column] = bits_to_indices(bits, w) << (LABEL_BITS - bits_per_symbol(w))
         return out
 
     def _payload(self, burst: int, payload_symbols: int) -> list[NDArray[np.uint8]]:
         """Payload bits of a burst, by column."""
-        sizes = [payload_symbols * bits_per_symbol(w) for w in self._w(burst)]
+        sizes = self._sizes(burst, payload_symbols)
         total = self._burst_bits(burst, payload_symbols)
         if self.content is not None:
             turns = [self._burst_bits(turn, payload_symbols) for turn in range(len(self.weights))]
@@ -216,13 +217,13 @@ class RawSending:
             return [np.resize(number, size) for size in sizes]
         return [bits[:size] for size in sizes] if self.same else np.split(bits, np.cumsum(sizes)[:-1])
 
-    def _w(self, burst: int) -> list[int]:
-        return [int(w) for w in self.weights[burst % len(self.weights)]]
+    def _sizes(self, burst: int, payload_symbols: int) -> list[int]:
+        """Bits of a burst, by column."""
+        return [payload_bits(int(w), payload_symbols) for w in self.weights[burst % len(self.weights)]]
 
     def _burst_bits(self, burst: int, payload_symbols: int) -> int:
         """Different bits of a burst."""
-        bits = [payload_symbols * bits_per_symbol(w) for w in self._w(burst)]
-        return max(bits) if self.same else sum(bits)
+        return (max if self.same else sum)(self._sizes(burst, payload_symbols))
 
     def usual_bursts(self, columns: int, payload_symbols: int) -> int:
         """Bursts after which the payload begins anew; of random bits and a counter some."""
@@ -316,4 +317,4 @@ def packet_slots_of(labels: Labels, weights: NDArray[np.int64]) -> NDArray[np.ui
 
 def visible_bits_of_burst(weights: NDArray[np.int64], payload_symbols: int) -> int:
     """Payload bits of one burst over all columns with weights (C,)."""
-    return payload_symbols * sum(bits_per_symbol(int(w)) for w in weights)
+    return sum(payload_bits(int(w), payload_symbols) for w in weights)

@@ -345,12 +345,20 @@ def test_shares_of_a_way_without_another_are_left_out() -> None:
     assert row["share"] == 1
 
 
-def test_the_headline_puts_receiver_and_yardsticks_side_by_side() -> None:
-    record = _record("sky")
-    record["ways"]["paper"] = record["ways"]["bound"]
-    (row,) = quick._by_label("scene", [record, record], quick._ERRORS)
-    assert (row["scene"], row["packets"], row["error_free"]) == ("sky", 20, 16)
-    assert row["receiver"] == row["bound"] == pytest.approx((5 + 77 / 2) / 770)
+def test_the_headline_puts_receiver_and_yardsticks_beside_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = _record("sky") | {"bare_wall_s": 0.1, "bare_cpu_s": 0.1, "n_frames": 1}
+    record["ways"] = dict.fromkeys(("receiver", "bound", "paper", "two threads"), record["ways"]["receiver"])
+    record["ways"] = {way: some | {"wall_s": 0.2, "cpu_s": 0.3} for way, some in record["ways"].items()}
+    monkeypatch.setattr(quick, "start_times", lambda _: {"bare python": 20.0})
+    (_, errors), (_, times), (_, checks) = quick.run(lambda *_: [record, record], 0, tmp_path)  # type: ignore[arg-type]
+    assert [(row["scenes"], row["way"], row["right"]) for row in errors] == [
+        ("sky", way, 16) for way in ("receiver", "bound", "paper")
+    ]
+    assert all(row["ber"] == pytest.approx((5 + 77 / 2) / 770) for row in errors)
+    assert (times[0]["over_bare_wall"], times[0]["over_bare"]) == (pytest.approx(2), pytest.approx(3))
+    assert checks == [{"check": "20 random scenes", "result": "ok"}, {"check": "bare python", "result": "20 ms"}]
 
 
 # Commands.

@@ -16,7 +16,7 @@ import numpy as np
 
 from rxcli.lab.benchmark.cases import Case
 from rxcli.lab.benchmark.media import Medium, camera_path
-from rxcli.lab.benchmark.trial import Trial, known_camera, known_corners, write_still
+from rxcli.lab.benchmark.trial import Trial, known_options, write_still
 from rxcli.lab.simulate.capture import Recording, prepare
 from rxcli.lab.simulate.files import Encoding, write_video
 from rxcli.lab.simulate.no_data import STRIPED_KINDS, draw_kind, no_data_scene
@@ -128,9 +128,8 @@ def recorded(
             write_video(recording.pictures(), paths[0], encoding, scene.frame_rate_hz, scene.orientation)
         about = {"screen": scene.screen.name, "camera": scene.camera_name, "rows_per_slot": scene.rows_per_slot}
         known: dict[str, Any] = {"truth": msgspec.convert(whole, Truth, str_keys=True), "whole_truth": whole}
-        corners, cameras = known_corners(exposure), (known_camera(exposure),)
-        named = ReceiverOptions(screens=(scene.screen,), cameras=cameras, force_camera=True, corners=corners)
-        yield Case(source=tuple(paths), options=named, about=about, corners=corners, trials=tuple(trials), **known)
+        named, sources = known_options(exposure), dict[str, Any](source=tuple(paths), trials=tuple(trials))
+        yield Case(options=named, about=about, corners=named.corners, **sources, **known)
 
 
 # Pictures without data.

@@ -5,66 +5,41 @@ import sys
 import time
 from pathlib import Path
 from statistics import median
-from typing import Any
 
 import msgspec
 
 from rxcli.lab.benchmark.cases import Record
-from rxcli.lab.benchmark.measures import MEASURES, Group, Row
-from rxcli.lab.benchmark.runner import CHECKOUT, Run, scenarios
+from rxcli.lab.benchmark.measures import Group, Row, rows
+from rxcli.lab.benchmark.runner import CHECKOUT, Run, Scenario, scenarios
 
 _MEDIA = ("body 26 MP", "RAW 26 MP", "body 26 MP, little light", "phone 12 MP")
 #: Runs of each medium, and small random scenes.
 _REPEATS, _SCENES = 3, 20
-#: Column of a table -> way and measure.
-_ERRORS = {
-    "packets": ("receiver", "expected"),
-    "receiver": ("receiver", "ber"),
-    "receiver95": ("receiver", "ber95"),
-    "bound": ("bound", "ber"),
-    "paper": ("paper", "ber"),
-    "error_free": ("receiver", "right"),
-    "false": ("receiver", "false"),
-}
-_TIMES = {
-    "bare_ms": ("two threads", "bare_ms"),
-    "total_ms": ("two threads", "total_ms"),
-    "ratio": ("two threads", "over_bare_wall"),
-    "cpu_ratio": ("two threads", "over_bare"),
-    "target": ("two threads", "target"),
-    "status": ("two threads", "status"),
-}
+#: Measures of error and of time.
+_ERRORS = ("expected", "right", "false", "ber", "ber95")
+_TIMES = ("bare_ms", "total_ms", "over_bare_wall", "over_bare", "target", "status")
 
 
 def run(how: Run, seed: int, folder: Path) -> list[tuple[str, list[Row]]]:
     """Measure the headline: titles and tables; the media that are timed lie in `folder`."""
 
-    def records(name: str, count: int, **changes: Any) -> list[Record]:
-        scenario = msgspec.structs.replace(scenarios()[name], **changes)
+    def records(scenario: Scenario, name: str, count: int) -> list[Record]:
         return how(scenario.tasks(seed, count, folder), name)
 
-    speed = {name: point for name, point in scenarios()["speed"].points.items() if name in _MEDIA}
-    errors = _by_label("scene", records("quick", scenarios()["quick"].count), _ERRORS)
-    problems = Group(
-        records("stability", _SCENES, ways=("receiver",), points={"": {"named": True}}), "receiver", "receiver"
-    ).problems
-    timed = _by_label("medium", records("speed", _REPEATS, points=speed, ways=("two threads",)), _TIMES)
+    quick, changed = scenarios()["quick"], msgspec.structs.replace
+    media = {name: point for name, point in scenarios()["speed"].points.items() if name in _MEDIA}
+    speed = changed(scenarios()["speed"], points=media, ways=("two threads",))
+    stability = changed(scenarios()["stability"], points={"": {"named": True}}, ways=("receiver",))
+    problems = Group(records(stability, "stability", _SCENES), "receiver", "receiver").problems
+    # The rows of all scenes and of all media mean little.
+    errors = rows(records(quick, "quick", quick.count), quick.ways, _ERRORS)[: -len(quick.ways)]
+    timed = rows(records(speed, "speed", _REPEATS), speed.ways, _TIMES)[:-1]
     checks = {f"{_SCENES} random scenes": "; ".join(dict.fromkeys(problems)) or "ok"}
     checks |= {name: f"{ms:.0f} ms" for name, ms in start_times(_REPEATS).items()}
     return [
         ("bit error rate, lost packets included: receiver, bound, the paper's pipeline", errors),
         ("time on two threads, of the wall and of the processor, against the bare decode", timed),
         ("checks", [{"check": name, "result": result} for name, result in checks.items()]),
-    ]
-
-
-def _by_label(heading: str, records: list[Record], columns: dict[str, tuple[str, str]]) -> list[Row]:
-    """A row for each point of a scenario; see `_ERRORS`."""
-    labels = dict.fromkeys(record["groups"][0] for record in records)
-    cases = {label: [record for record in records if record["groups"][0] == label] for label in labels}
-    return [
-        {heading: label, **{name: MEASURES[measure](Group(mine, way, way)) for name, (way, measure) in columns.items()}}
-        for label, mine in cases.items()
     ]
 
 

@@ -1,6 +1,6 @@
 """One trial: a simulated frame as a receiver gets it, and what the simulator knows of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -39,12 +39,12 @@ class Trial:
     @cached_property
     def camera(self) -> CameraProfile:
         """The camera as a perfect calibration would know it."""
-        return known_camera(self.capture.exposure)
+        return self.options().cameras[0]
 
     @cached_property
-    def corners(self) -> FloatArray:
+    def corners(self) -> FloatArray | None:
         """(4, 2) the screen's corners on the stored picture, top-left first, clockwise for a viewer."""
-        return known_corners(self.capture.exposure)
+        return self.options().corners
 
     @cached_property
     def truth(self) -> Truth:
@@ -58,9 +58,8 @@ class Trial:
             known_outline: hand over the true corners; otherwise the receiver looks for the screen.
             more: further fields of `ReceiverOptions`.
         """
-        known: dict[str, Any] = {"screens": (self.capture.scene.screen,), "cameras": (self.camera,)}
-        corners = self.corners if known_outline else None
-        return ReceiverOptions(**known, force_camera=True, corners=corners, **more)
+        known = known_options(self.capture.exposure)
+        return replace(known, corners=known.corners if known_outline else None, **more)
 
 
 def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False) -> Trial:
@@ -77,16 +76,14 @@ def write_still(capture: Capture, stem: Path) -> Path:
     return path
 
 
-def known_camera(exposure: Exposure) -> CameraProfile:
-    """The camera as a perfect calibration would know it."""
-    tone = exposure.scene.isp.tone if exposure.scene.isp.tone in ("linear", "srgb", "bt709") else "auto"
-    return msgspec.structs.replace(build_camera_profile(exposure.scene, exposure), tone=tone)
-
-
-def known_corners(exposure: Exposure) -> FloatArray:
-    """(4, 2) the screen's corners on the stored picture, top-left first, clockwise for a viewer."""
-    corrected = exposure.scene.isp.correct_distortion and not exposure.scene.is_mosaic
-    return corrected_corners(exposure.view) if corrected else exposure.corners
+def known_options(exposure: Exposure) -> ReceiverOptions:
+    """Options that name screen, corners, and the camera as a perfect calibration would know it."""
+    scene = exposure.scene
+    tone = scene.isp.tone if scene.isp.tone in ("linear", "srgb", "bt709") else "auto"
+    camera = msgspec.structs.replace(build_camera_profile(scene, exposure), tone=tone)
+    is_corrected = scene.isp.correct_distortion and not scene.is_mosaic
+    corners = corrected_corners(exposure.view) if is_corrected else exposure.corners
+    return ReceiverOptions(screens=(scene.screen,), cameras=(camera,), force_camera=True, corners=corners)
 
 
 def corrected_corners(view: View) -> FloatArray:
