@@ -8,12 +8,10 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from ingest_files import XTRANS
 from numpy.typing import NDArray
-from small_scene import camera_of, reception
+from small_scene import reception, scored
 
-from rxcli.lab.benchmark.trial import simulate_trial
-from rxcli.lab.simulate.capture import Capture, simulate_frame
+from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, usual_screens
@@ -27,8 +25,8 @@ from rxcli.receiver.receive import receive, receive_frame
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.still import initial_pass
 from rxcli.results.reasons import explained
-from rxcli.results.truth import Score, Scorer, Truth
-from rxcli.types import Clock, Frame, FrameResult, Metadata, Mosaic, PacketResult
+from rxcli.results.truth import Score
+from rxcli.types import Clock, Frame, FrameResult, Metadata
 
 FloatArray = NDArray[np.float64]
 
@@ -46,47 +44,26 @@ def small_scene(screen: str, camera: str = "xs10-still", picture: str = "sky", e
 
 
 @cache
-def capture(screen: str, camera: str, picture: str, electrons: float, seed: int) -> Capture:
-    return simulate_frame(small_scene(screen, camera, picture, electrons), seed)
+def taken_of(screen: str, camera: str, picture: str, electrons: float, seed: int) -> Trial:
+    return simulate_trial(small_scene(screen, camera, picture, electrons), seed)
 
 
-def clean(seed: int = 1) -> Capture:
-    return capture("paper-34k6", "xs10-still", "sky", 30.0, seed)
+def clean() -> Trial:
+    return taken_of("paper-34k6", "xs10-still", "sky", 30.0, 1)
 
 
-def corners_of(taken: Capture) -> FloatArray:
-    """The corners on the delivered picture."""
-    import cv2
-
-    camera, corners = taken.truth["camera"], np.array(taken.truth["corners_sensor_px"])
-    if not camera["distortion_already_corrected"]:
-        return corners
-    matrix, coeffs = np.array(camera["camera_matrix"]), np.array(camera["dist_coeffs"])
-    return np.asarray(cv2.undistortPoints(corners[:, None], matrix, coeffs, P=matrix)[:, 0], np.float64)
-
-
-def options_for(taken: Capture, **changes: object) -> ReceiverOptions:
-    screens = (load_profile(taken.truth["screen"], ScreenProfile),)
-    camera = camera_of(taken.truth["camera"], taken.truth["tone_curve"])
-    options = ReceiverOptions(screens=screens, cameras=(camera,), force_camera=True)
-    return replace(options, **{"corners": corners_of(taken), **changes})  # type: ignore[arg-type]
-
-
-def frame_of(taken: Capture, pixels: NDArray[np.uint8] | None = None, orientation: int = 1) -> Frame:
-    metadata = Metadata(exposure_s=taken.truth["camera"]["exposure_s"], orientation=orientation)
-    shown = taken.pixels if pixels is None else pixels
-    return Frame(shown, "memory", metadata=metadata)
-
-
-def received(frame: Frame, options: ReceiverOptions) -> FrameResult:
-    (result,) = receive([frame], options)
+def received(trial: Trial, frame: Frame | None = None, **changes: Any) -> FrameResult:
+    """The result of a trial's frame, or of another one, with screen, camera and corners named but for the changes."""
+    (result,) = receive([frame or trial.frame], replace(trial.options(), **changes))
     return explained(result)
 
 
-def score_of(result: FrameResult, taken: Capture) -> Score:
-    scorer = Scorer(msgspec.convert(taken.truth, Truth, strict=False))
-    scorer.add(result)
-    return scorer.score()
+def score_of(result: FrameResult, trial: Trial) -> Score:
+    return scored(result, trial.truth)[1]
+
+
+def with_pixels(trial: Trial, pixels: NDArray[Any], **changes: Any) -> Frame:
+    return replace(trial.frame, pixels=np.ascontiguousarray(pixels), **changes)
 
 
 @pytest.mark.parametrize(
@@ -94,8 +71,8 @@ def score_of(result: FrameResult, taken: Capture) -> Score:
     [("paper-34k6", "xs10-still"), ("paper-17k3", "xs10-still"), ("paper-8k65", "phone-plain")],
 )
 def test_a_clean_frame_gives_every_packet(screen: str, camera: str) -> None:
-    taken = capture(screen, camera, "sky", 30.0, 1)
-    result = received(frame_of(taken), options_for(taken))
+    taken = taken_of(screen, camera, "sky", 30.0, 1)
+    result = received(taken)
     score = score_of(result, taken)
     assert score.expected >= 20
     assert (score.error_free, score.false, score.wrong_w) == (score.expected, 0, 0)
@@ -103,30 +80,30 @@ def test_a_clean_frame_gives_every_packet(screen: str, camera: str) -> None:
     assert result.message is None
     assert result.screen_profile == screen
     assert [c.column for c in result.columns] == list(range(20))
-    packets = [p for c in result.columns for p in c.packets]
+    packets = result.packets
     assert min(p.confidence for p in packets) > 0.9
     assert all(c.snr_db is not None and c.snr_db > 5 for c in result.columns)
 
 
 @cache
-def proportioned() -> Capture:
+def proportioned() -> Trial:
     scene = replace(preset("xs10-still", "paper-8k65"), picture="sky", start_slot=20.0).scaled(0.25, keep_readout=True)
-    return simulate_frame(replace(scene, light_e_per_s=2 * scene.light_e_per_s), 1)
+    return simulate_trial(replace(scene, light_e_per_s=2 * scene.light_e_per_s), 1)
 
 
 def test_the_screen_is_found_in_a_frame_of_true_proportions() -> None:
     taken = proportioned()
-    result = received(frame_of(taken), options_for(taken, corners=None))
+    result = received(taken, corners=None)
     score = score_of(result, taken)
     assert score.expected >= 20
     assert score.error_free == score.expected
-    off = np.linalg.norm(result.corners - corners_of(taken), axis=1)
+    off = np.linalg.norm(result.corners - taken.corners, axis=1)
     assert off.max() < 0.005 * np.ptp(result.corners[:, 0])
 
 
 def test_stripes_bent_by_a_correction_in_the_camera() -> None:
-    taken = capture("paper-17k3", "phone-corrected", "sky", 20.0, 2)
-    score = score_of(received(frame_of(taken), options_for(taken)), taken)
+    taken = taken_of("paper-17k3", "phone-corrected", "sky", 20.0, 2)
+    score = score_of(received(taken), taken)
     assert score.expected >= 20
     assert score.error_free == score.expected
     assert score.false == 0
@@ -134,12 +111,8 @@ def test_stripes_bent_by_a_correction_in_the_camera() -> None:
 
 def test_raw_mosaic() -> None:
     scene = replace(small_scene("paper-34k6"), output="raw")
-    taken = simulate_frame(scene, 4)
-    sensor = scene.sensor
-    level = float(sensor.black_level)
-    mosaic = Mosaic(XTRANS, (1 / 0.55, 1.0, 1 / 0.65), (level, level, level), float(sensor.white_level))
-    frame = Frame(taken.raw, "memory", mosaic=mosaic)
-    score = score_of(received(frame, options_for(taken)), taken)
+    taken = simulate_trial(scene, 4)
+    score = score_of(received(taken), taken)
     assert score.error_free >= 0.9 * score.expected
     assert (score.false, score.wrong_w) == (0, 0)
 
@@ -147,10 +120,9 @@ def test_raw_mosaic() -> None:
 @pytest.mark.parametrize(("factor", "known"), [(3, True), (10, False)])
 def test_a_wrongly_stated_exposure_is_estimated_and_the_difference_is_said(factor: float, known: bool) -> None:
     taken = clean()
-    frame, options = frame_of(taken), options_for(taken)
-    stated_s = factor * taken.truth["camera"]["exposure_s"]
-    frame = replace(frame, metadata=Metadata(exposure_s=stated_s))
-    result = received(frame, options if known else replace(options, cameras=(), force_camera=False))
+    stated_s = factor * taken.capture.scene.exposure_s
+    frame = replace(taken.frame, metadata=Metadata(exposure_s=stated_s))
+    result = received(taken, frame, **{} if known else {"cameras": (), "force_camera": False})
     assert score_of(result, taken).error_free == 20
     assert f"the stated exposure ({1e6 * stated_s:.0f} us)" in str(result.message)
 
@@ -158,13 +130,12 @@ def test_a_wrongly_stated_exposure_is_estimated_and_the_difference_is_said(facto
 @pytest.mark.parametrize("change", [{"line_delay_s": 7e-6}, {"width": 99}])
 def test_a_profile_that_gives_no_packet_is_no_veto(change: dict[str, Any]) -> None:
     taken = clean()
-    options = options_for(taken)
-    (mode,) = options.cameras[0].modes
-    wrong = msgspec.structs.replace(options.cameras[0], modes=(msgspec.structs.replace(mode, **change),))
-    result = received(frame_of(taken), replace(options, cameras=(wrong,)))
+    (mode,) = taken.camera.modes
+    wrong = msgspec.structs.replace(taken.camera, modes=(msgspec.structs.replace(mode, **change),))
+    result = received(taken, cameras=(wrong,))
     assert score_of(result, taken).error_free == 20
     assert result.camera_profile is None
-    assert "camera profile truth" in str(result.message)
+    assert f"camera profile {taken.camera.name}" in str(result.message)
 
 
 class CountedPixels(np.ndarray[Any, Any]):
@@ -182,16 +153,16 @@ class CountedPixels(np.ndarray[Any, Any]):
 def n_reads(frame: Frame, options: ReceiverOptions) -> tuple[float, str]:
     """How often each pixel of a frame is read on average, and the status."""
     pixels = frame.pixels.view(CountedPixels)
-    result = received(replace(frame, pixels=pixels), options)
+    (result,) = receive([replace(frame, pixels=pixels)], options)
     return pixels.n_taken / pixels.size, result.status
 
 
 def test_every_pixel_of_a_still_is_read_once() -> None:
     taken = clean()
-    assert n_reads(frame_of(taken), options_for(taken)) == (1.0, "ok")
+    assert n_reads(taken.frame, taken.options()) == (1.0, "ok")
     searched = ReceiverOptions(cameras=(), skip=frozenset())
     # Some lines of this narrow picture are read again to explain the refusal.
-    assert 1.0 <= n_reads(frame_of(taken), searched)[0] < 1.3
+    assert 1.0 <= n_reads(taken.frame, searched)[0] < 1.3
 
 
 def test_every_pixel_of_a_picture_without_a_screen_is_read_once_and_some_for_the_message() -> None:
@@ -204,46 +175,37 @@ def test_every_pixel_of_a_picture_without_a_screen_is_read_once_and_some_for_the
 def test_upside_down() -> None:
     """Turned by half a turn on the sensor: time runs on, the columns run from right to left."""
     taken = clean()
-    options = options_for(taken)
-    turned = frame_of(taken, np.ascontiguousarray(taken.pixels[:, ::-1]), orientation=2)
-    mirrored = options.corners * [-1, 1] + [taken.pixels.shape[1] - 1, 0]
-    lens = options.cameras[0].lens
-    assert lens is not None
-    plain = msgspec.structs.replace(options.cameras[0], lens=None)
-    score = score_of(received(turned, replace(options, corners=mirrored, cameras=(plain,))), taken)
+    turned = with_pixels(taken, taken.frame.pixels[:, ::-1], metadata=Metadata(orientation=2))
+    mirrored = taken.corners * [-1, 1] + [taken.frame.width - 1, 0]
+    plain = msgspec.structs.replace(taken.camera, lens=None)
+    score = score_of(received(taken, turned, corners=mirrored, cameras=(plain,)), taken)
     assert score.error_free >= 18
     assert score.false == 0
-
-
-def scored_packets(result: FrameResult, taken: Capture) -> list[PacketResult]:
-    """All packets with their wrong bits."""
-    scorer = Scorer(msgspec.convert(taken.truth, Truth, strict=False))
-    return [p for c in scorer.add(result).columns for p in c.packets]
 
 
 @pytest.mark.parametrize(
     ("electrons", "at_least", "at_most"), [(30.0, 16, 20), (1.0, 5, 20), (0.2, 0, 20), (0.02, 0, 0)]
 )
 def test_from_clean_to_hopeless_nothing_false(electrons: float, at_least: int, at_most: int) -> None:
-    taken = capture("paper-34k6", "xs10-still", "coffee", electrons, 3)
-    result = received(frame_of(taken), options_for(taken))
+    taken = taken_of("paper-34k6", "xs10-still", "coffee", electrons, 3)
+    result = received(taken)
     score = score_of(result, taken)
     assert at_least <= score.error_free <= at_most
     assert score.false == 0
-    sure = [p for p in scored_packets(result, taken) if p.confidence > 0.9]
+    sure = [p for p in scored(result, taken.truth)[0].packets if p.confidence > 0.9]
     assert sum(p.bit_errors != 0 for p in sure) <= max(1, 0.15 * len(sure))
 
 
 @cache
-def overexposed() -> Capture:
+def overexposed() -> Trial:
     """Thirty times too much light: nearly all slots are clipped."""
     scene = small_scene("paper-34k6")
-    return simulate_frame(replace(scene, sensor=replace(scene.sensor, full_scale_e=180.0)), 1)
+    return simulate_trial(replace(scene, sensor=replace(scene.sensor, full_scale_e=180.0)), 1)
 
 
 def test_overexposure_gives_nothing_that_is_believed() -> None:
     taken = overexposed()
-    packets = scored_packets(received(frame_of(taken), options_for(taken)), taken)
+    packets = scored(received(taken), taken.truth)[0].packets
     wrong = [p.confidence for p in packets if p.bit_errors != 0]
     assert max(wrong, default=0) < 0.9
     assert sum(confidence >= 0.5 for confidence in wrong) <= 1
@@ -267,7 +229,7 @@ def test_the_network_is_shown_what_its_time_allows(
     monkeypatch.setattr(still, "_denoiser", Recording)
     monkeypatch.setattr(still, "STILL", msgspec.structs.replace(still.STILL, max_network_slots=budget))
     taken = overexposed()
-    report = received(frame_of(taken), options_for(taken)).denoiser
+    report = received(taken).denoiser
     assert shown == [report["columns"]]
     assert least <= shown[0] <= most
 
@@ -280,15 +242,15 @@ def test_the_network_has_no_say_in_the_length_of_packets(monkeypatch: pytest.Mon
     monkeypatch.setattr(receiving, "framing_of", lambda a, r, *rest: (seen.append(r), framing_of(a, r, *rest))[1])
     monkeypatch.setattr(receiving, "apply_autoencoder", lambda a, r, options: (seen.append(r), apply(a, r, options))[1])
     taken = overexposed()
-    assert received(frame_of(taken), options_for(taken)).denoiser["columns"] > 0
+    assert received(taken).denoiser["columns"] > 0
     assert all(judged is shown for judged, shown in zip(seen[::2], seen[1::2], strict=True))
 
 
 def test_weights_that_differ_by_column() -> None:
     w = tuple(1 + column % 9 for column in range(20))
     scene = replace(small_scene("paper-34k6"), w=w)
-    taken = simulate_frame(scene, 6)
-    result = received(frame_of(taken), options_for(taken))
+    taken = simulate_trial(scene, 6)
+    result = received(taken)
     assert [c.w for c in result.columns] == list(w)
     assert score_of(result, taken).error_free >= 18
 
@@ -296,20 +258,20 @@ def test_weights_that_differ_by_column() -> None:
 @pytest.mark.parametrize("reach", [0.5, 2.0])
 def test_columns_with_delays(reach: float) -> None:
     scene = replace(small_scene("paper-34k6"), column_delay_slots=reach, slot_rate_error_ppm=100.0)
-    taken = simulate_frame(scene, 7)
-    result = received(frame_of(taken), options_for(taken))
+    taken = simulate_trial(scene, 7)
+    result = received(taken)
     score = score_of(result, taken)
     assert score.error_free >= 0.9 * score.expected
-    assert not [p for p in scored_packets(result, taken) if p.bit_errors and p.confidence >= 0.5]
+    assert not [p for p in scored(result, taken.truth)[0].packets if p.bit_errors and p.confidence >= 0.5]
     found = np.array([c.delay_slots for c in result.columns])
-    off = found - np.array(taken.truth["column_delay_slots"])
+    off = found - np.array(taken.capture.truth["column_delay_slots"])
     assert np.quantile(np.abs(off - np.median(off)), 0.8) < 0.2
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])
 def test_upright_columns_are_received_though_the_file_says_portrait(orientation: int) -> None:
     taken = clean()
-    result = received(frame_of(taken, orientation=orientation), options_for(taken))
+    result = received(taken, replace(taken.frame, metadata=Metadata(orientation=orientation)))
     assert score_of(result, taken).error_free == 20
     assert "the columns stand upright in the stored picture" in str(result.message)
 
@@ -319,51 +281,49 @@ def test_upright_columns_are_received_though_the_file_says_portrait(orientation:
 )
 def test_a_picture_that_was_turned_afterwards_is_received_turned_back(quarter_turns: int, note: str) -> None:
     taken = proportioned()
-    frame = frame_of(taken, np.ascontiguousarray(np.rot90(taken.pixels, quarter_turns)))
-    result = received(frame, options_for(taken, corners=None))
+    frame = with_pixels(taken, np.rot90(taken.frame.pixels, quarter_turns))
+    result = received(taken, frame, corners=None)
     assert note in str(result.message)
     upside_down = quarter_turns == 2
     assert score_of(result.with_columns_mirrored() if upside_down else result, taken).error_free >= 18
     assert result.quarter_turns == (0 if upside_down else 4 - quarter_turns)
     back, turned_back = as_received(frame, result)
     if not upside_down:
-        assert np.array_equal(back.pixels, taken.pixels)
-        assert np.abs(turned_back.corners - corners_of(taken)).max() < 8
+        assert np.array_equal(back.pixels, taken.frame.pixels)
+        assert np.abs(turned_back.corners - taken.corners).max() < 8
 
 
 def test_what_is_not_believed_stands_in_the_result() -> None:
     taken = clean()
-    frame = replace(frame_of(taken), metadata=Metadata(not_believed=("EXIF orientation 3",)))
-    assert received(frame, options_for(taken)).message == "not believed: EXIF orientation 3"
+    frame = replace(taken.frame, metadata=Metadata(not_believed=("EXIF orientation 3",)))
+    assert received(taken, frame).message == "not believed: EXIF orientation 3"
 
 
 def test_a_screen_too_small_says_how_much_it_needs() -> None:
     """One packet at 8.65 kHz lasts 8.09 ms: 34 % of the 24.1 ms of a whole readout."""
     taken = clean()
-    lens_free = msgspec.structs.replace(camera_of(taken.truth["camera"], taken.truth["tone_curve"]), lens=None)
-    height, width = 1040, taken.pixels.shape[1]
+    height, width = 1040, taken.frame.width
     line_delay = 24.098e-3 / height
-    mode = msgspec.structs.replace(lens_free.modes[0], height=height, line_delay_s=line_delay)
-    camera = msgspec.structs.replace(lens_free, modes=(mode,))
+    mode = msgspec.structs.replace(taken.camera.modes[0], height=height, line_delay_s=line_delay)
+    camera = msgspec.structs.replace(taken.camera, lens=None, modes=(mode,))
     pixels = np.full((height, width), 20, np.uint8)
     top, bottom = 300, 300 + round(0.251 * height)
     pixels[top:bottom, 100:500] = np.random.default_rng(0).choice([30, 160], bottom - top)[:, None]
     corners = np.array([[100.0, top], [499, top], [499, bottom], [100, bottom]])
-    options = ReceiverOptions(
-        screens=(load_profile("paper-8k65", ScreenProfile),), cameras=(camera,), force_camera=True, corners=corners
-    )
-    result = received(frame_of(taken, pixels), options)
+    known = {"screens": (load_profile("paper-8k65", ScreenProfile),), "corners": corners}
+    frame = with_pixels(taken, pixels)
+    result = received(taken, frame, cameras=(camera,), **known)
     assert result.status == "no_signal"
     assert "the screen fills 25 % of the height: one packet at 8.65 kHz needs 34 % with this camera" in result.message
     quick = msgspec.structs.replace(camera, modes=(msgspec.structs.replace(mode, line_delay_s=line_delay / 4),))
-    result = received(frame_of(taken, pixels), replace(options, cameras=(quick,)))
+    result = received(taken, frame, cameras=(quick,), **known)
     assert "a picture shows 19 % of a packet: send 6 more photos, or film" in result.message
     assert result.message.index("the screen may have no profile here") < result.message.index("a faster slot rate")
 
 
-def without_signal(kind: str, taken: Capture) -> NDArray[np.uint8]:
+def without_signal(kind: str, taken: Trial) -> NDArray[np.uint8]:
     rng = np.random.default_rng(0)
-    shape = taken.pixels.shape
+    shape = taken.frame.pixels.shape
     if kind == "noise":
         return rng.integers(0, 256, shape, dtype=np.uint8)
     if kind == "still screen":
@@ -386,9 +346,9 @@ NOTHING = ["black", "saturated", "grey", "noise", "still screen", "lamp at 100 H
 @pytest.mark.parametrize("kind", NOTHING)
 def test_no_packet_where_none_was_sent(kind: str, given: bool) -> None:
     taken = clean()
-    options = options_for(taken) if given else options_for(taken, corners=None)
-    result = received(frame_of(taken, without_signal(kind, taken)), options)
-    assert not [p for c in result.columns for p in c.packets]
+    frame = with_pixels(taken, without_signal(kind, taken))
+    result = received(taken, frame, **{} if given else {"corners": None})
+    assert not result.packets
     assert result.status == ("no_signal" if given else result.status)
     assert result.status in {"no_screen", "no_signal"}
     assert result.message
@@ -397,13 +357,12 @@ def test_no_packet_where_none_was_sent(kind: str, given: bool) -> None:
 
 def test_a_picture_without_a_screen_is_stopped_at_once_unless_told_not_to() -> None:
     taken = clean()
-    grey = frame_of(taken, without_signal("grey", taken))
-    options = options_for(taken, corners=None)
-    stopped = received(grey, options)
+    grey = with_pixels(taken, without_signal("grey", taken))
+    stopped = received(taken, grey, corners=None)
     assert stopped.status == "no_screen"
     assert stopped.skipped == {"no_screen": 1}
     assert "clock" not in stopped.timing_ms
-    tried = received(grey, replace(options, skip=options.skip - {"no_screen"}))
+    tried = received(taken, grey, corners=None, skip=taken.options().skip - {"no_screen"})
     assert tried.status == "no_signal"
     assert "no_screen" not in tried.skipped
     assert "clock" in tried.timing_ms
@@ -411,23 +370,22 @@ def test_a_picture_without_a_screen_is_stopped_at_once_unless_told_not_to() -> N
 
 def test_a_camera_without_this_size_is_named() -> None:
     taken = clean()
-    result = received(frame_of(taken, taken.pixels[:1000]), options_for(taken))
+    result = received(taken, with_pixels(taken, taken.frame.pixels[:1000]))
     assert result.status == "no_signal"
-    assert "truth" in result.message
-    assert f"{taken.pixels.shape[1]} x 1000" in result.message
+    assert taken.camera.name in result.message
+    assert f"{taken.frame.width} x 1000" in result.message
 
 
 def test_min_confidence_leaves_out_what_is_less_sure() -> None:
-    taken = capture("paper-34k6", "xs10-still", "coffee", 1.0, 3)
-    everything = received(frame_of(taken), options_for(taken))
-    sure = received(frame_of(taken), options_for(taken, min_confidence=0.9))
-    expected = [p for c in everything.columns for p in c.packets if p.confidence >= 0.9]
-    assert [p for c in sure.columns for p in c.packets] == expected
+    taken = taken_of("paper-34k6", "xs10-still", "coffee", 1.0, 3)
+    everything = received(taken)
+    sure = received(taken, min_confidence=0.9)
+    assert sure.packets == tuple(p for p in everything.packets if p.confidence >= 0.9)
 
 
 def test_stages_are_timed() -> None:
     taken = clean()
-    timing = received(frame_of(taken), options_for(taken)).timing_ms
+    timing = received(taken).timing_ms
     assert {"geometry", "sampling", "clock", "detect", "total"} <= timing.keys()
     assert timing["total"] >= max(value for name, value in timing.items() if name != "total")
 
@@ -447,8 +405,8 @@ def test_slots_of_few_rows_are_received_although_developing_mixes_rows() -> None
     assert sum(score.false for score in mixed) <= 1
 
 
-def found_in(taken: Capture, options: ReceiverOptions) -> Found:
-    found = search(FrameCache(frame_of(taken)), options)
+def found_in(taken: Trial, **changes: Any) -> Found:
+    found = search(FrameCache(taken.frame), replace(taken.options(), **changes))
     assert isinstance(found, Found)
     return found
 
@@ -456,8 +414,8 @@ def found_in(taken: Capture, options: ReceiverOptions) -> Found:
 def test_packets_determine_the_bursts_where_the_similarity_of_copies_leaves_doubt(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    taken = simulate_frame(replace(small_scene("paper-17k3", "phone-plain"), start_slot=300.0), 1)
-    best = found_in(taken, options_for(taken)).best
+    taken = simulate_trial(replace(small_scene("paper-17k3", "phone-plain"), start_slot=300.0), 1)
+    best = found_in(taken).best
     right = best.reception.clock.burst
     assert right.max() > 0
     assert list(still.in_other_bursts(best.acquisition, best.reception)) == []
@@ -468,13 +426,12 @@ def test_packets_determine_the_bursts_where_the_similarity_of_copies_leaves_doub
 
     monkeypatch.setattr(still.sync, "possible_bursts", least_similar_first)
     assert not np.array_equal(initial_pass(best.acquisition).clock.burst, right)
-    assert np.array_equal(found_in(taken, options_for(taken)).best.reception.clock.burst, right)
+    assert np.array_equal(found_in(taken).best.reception.clock.burst, right)
 
 
 def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_not() -> None:
-    options = options_for(clean())
-    best = found_in(clean(), options).best
-    reception = still.decode(best.acquisition, options.skip, best.reception)
+    best = found_in(clean()).best
+    reception = still.decode(best.acquisition, clean().options().skip, best.reception)
     assert not headerless(reception).any()
     unseen = replace(reception.posteriors, header_llr=np.full_like(reception.posteriors.header_llr, -30.0))
     assert not headerless(replace(reception, posteriors=unseen)).any()
@@ -487,9 +444,8 @@ def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_no
 @pytest.mark.parametrize("screen", ["paper-8k65", "paper-17k3", "paper-34k6"])
 def test_packets_tell_the_screen(screen: str) -> None:
     """Pictures with strong texture hide all structure of a clock's slots."""
-    taken = capture(screen, "phone-plain", "sky", 30.0, 1)
-    options = replace(options_for(taken), screens=usual_screens())
-    assert found_in(taken, options).best.acquisition.screen.name == screen
+    taken = taken_of(screen, "phone-plain", "sky", 30.0, 1)
+    assert found_in(taken, screens=usual_screens()).best.acquisition.screen.name == screen
 
 
 @pytest.mark.parametrize(("period_rows", "duty"), [(19.3, 0.4), (14.2, 0.15), (27.9, 0.12), (32.1, 0.53), (25.7, 0.38)])
@@ -502,14 +458,14 @@ def test_a_screen_dimmed_by_switching_gives_no_packet(period_rows: float, duty: 
     rows = ((total[exposure:] - total[:-exposure]) / exposure)[::fine][:540]
     pixels = 30 + 400 * np.repeat(rows[:, None], 960, axis=1)
     pixels = np.clip(pixels + rng.normal(0, 4, pixels.shape), 0, 1023).astype(np.uint16)
-    frame = replace(frame_of(clean()), pixels=pixels, black=0.0, white=1023.0, mosaic=None, linear=True)
+    frame = replace(clean().frame, pixels=pixels, black=0.0, white=1023.0, mosaic=None, linear=True)
     corners = np.array([[0.5, 0.5], [958.5, 0.5], [958.5, 538.5], [0.5, 538.5]])
     for rows_per_slot in (1.9, 2.6, 3.4):
         mode = {"name": "s", "width": 960, "height": 540, "line_delay_s": 1 / (rows_per_slot * 17300)}
         mode |= {"exposure_s": 0.7 / 17300}
         camera = check_profile({"format": 1, "kind": "camera", "name": "c", "modes": [mode]}, CameraProfile, "test")
         (result,) = receive([frame], ReceiverOptions(cameras=(camera,), force_camera=True, corners=corners))
-        assert [p for c in result.columns for p in c.packets] == []
+        assert not result.packets
 
 
 @pytest.mark.parametrize("period_rows", [4, 5, 6])
