@@ -5,6 +5,8 @@ for input that cannot be read, for wrong configuration, and for wrong usage; `rx
 """
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import IntEnum
 
 
@@ -97,6 +99,36 @@ def reason_of(error: BaseException) -> str:
     parts = (part.decode("ascii", "replace") if isinstance(part, bytes) else str(part) for part in error.args)
     text = getattr(error, "strerror", None) or " ".join(parts) or type(error).__name__
     return " ".join(str(text).split())[:160]
+
+
+@contextmanager
+def failure_explained(reason: str, step: str, kind: type[ReceiverError] = InputError) -> Iterator[None]:
+    """Raise whatever the system or a library raises, on a damaged file some ten unrelated types, as an error of ours.
+
+    Args:
+        reason: file and fault; the other's own message is added.
+        step: next step.
+        kind: of the error.
+    """
+    try:
+        yield
+    except ReceiverError:
+        raise
+    except Exception as error:
+        raise kind(f"{reason} ({reason_of(error)})", step) from None
+
+
+def require(what: str, *packages: str) -> None:
+    """Refuse what needs packages that are not installed.
+
+    Raises:
+        UsageError: of the first one that is missing.
+    """
+    from importlib.util import find_spec
+
+    for package in packages:
+        if find_spec(package) is None:
+            raise UsageError(f"{what} needs the package {package}", f"pip install {package}")
 
 
 #: How libraries that cannot be loaded, threads that cannot be started and C code state a lack of memory.

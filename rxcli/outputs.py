@@ -13,7 +13,7 @@ import re
 import stat
 import zlib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
@@ -303,15 +303,18 @@ def make_parent(path: Path) -> None:
         raise unwritable(path, error) from None
 
 
-def check_replaceable(path: Path, ours: re.Pattern[bytes], option: str) -> None:
-    """Refuse to replace a foreign file, for names that are known only when they are written.
+def tapped(path: Path, ours: re.Pattern[bytes], option: str) -> AbstractContextManager[Path]:
+    """`replacing` for a file whose name is known only when it is written; its folder is made where there is none.
 
     Raises:
         UsageError: `path` exists and does not match `ours`.
+        OutputError: it cannot be written.
     """
+    make_parent(path)
     if is_stream(path):
         raise UsageError(f"{path}: is no file", "remove it, or name another folder")
     _check_ours(Output(option, path, ours), "name another folder")
+    return replacing(path, follow=False)
 
 
 def unwritable(

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, TypeVar, overload
 import msgspec
 from msgspec import Meta
 
-from rxcli.errors import ProfileError, UsageError, shortened
+from rxcli.errors import ProfileError, UsageError, failure_explained, shortened
 from rxcli.protocol import packet_slots
 from rxcli.resources import data_dir, profile_dirs, read_limited
 
@@ -167,12 +167,8 @@ _KINDS: dict[type[Any], str] = {ScreenProfile: "screens", CameraProfile: "camera
 
 
 def _parsed(text: str, source: str) -> dict[str, Any]:
-    try:
+    with failure_explained(f"{source}: not valid TOML", "correct the file, or name a shipped profile", ProfileError):
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # integers of thousands of digits, and brackets in brackets
-        reason = f"{error!s:.200}" if str(error) else type(error).__name__
-        hint = "correct the file, or name a shipped profile"
-        raise ProfileError(f"{source}: not valid TOML ({reason})", hint) from None
 
 
 def _kind_of(raw: dict[str, Any], source: str) -> type[Any]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import msgspec
 
-from rxcli.errors import ProfileError
+from rxcli.errors import ProfileError, failure_explained
 
 
 class _Config(msgspec.Struct, forbid_unknown_fields=True):
@@ -22,10 +22,8 @@ def option_defaults(path: Path) -> dict[str, Any]:
     Raises:
         ProfileError: the file is no TOML, or holds a key or a value that it should not.
     """
-    try:
+    step = "it may hold screen, camera and workers; correct the file, or remove it"
+    with failure_explained(f"{path}: cannot be read", step, ProfileError):
         config = msgspec.toml.decode(path.read_bytes(), type=_Config)
-    except (OSError, ValueError, RecursionError) as error:
-        reason = f"{path}: cannot be read ({error}); it may hold screen, camera and workers"
-        raise ProfileError(reason, "correct the file, or remove it") from None
     named = {"screens": config.screen, "cameras": config.camera, "workers": config.workers}
     return {name: [value] if isinstance(value, str) else value for name, value in named.items() if value is not None}

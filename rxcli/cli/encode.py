@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rxcli.cli.common import force_argument, options, output, refuse
 from rxcli.cli.kinds import FILE, POSITIVE
 from rxcli.cli.sending import LIGHT, raw_sending, sending_of
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import UsageError, failure_explained
 from rxcli.link.encoder import FileSending, Sending, TestLight, packet_slots_of, payload_hex, visible_bits_of_burst
 from rxcli.link.slots import WITHOUT_TEXT, WRITERS, bytes_per_row, order_of
 from rxcli.outputs import ENCODED, TRUTH, claim, unwritable, write_whole
@@ -25,7 +25,6 @@ from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import payload_bits
 from rxcli.results.report import plural
 
-_RATES = {"1/1.5": 0, "1/2": 1, "1/3": 2}
 #: Bursts that are computed at a time.
 _CHUNK = 256
 #: Share of the time that a usual 4K video shows: what a time needed is reckoned with.
@@ -49,8 +48,6 @@ _OUT_HELP = "Where to write: .npy or .csv; slots also as .bin, .h or .vcd; - for
     ("--slots", None, False, "Write the slots themselves instead of labels; so do --payload, .bin, .h and .vcd."),
     ("--truth", FILE, None, "Also write what is sent (JSON), for decode --truth."),
     ("--weights --w", str, "5", "Lit slots of ten: N, a list N,N,..., or a JSON file per burst."),
-    ("--mother", tuple(_RATES), "1/3", "Mother rate of a file's code."),
-    ("--object-id", click.IntRange(0, 65533), None, "Number of a file. [default: from its content]"),
 )
 @force_argument
 def encode(path: Path | None, out: Path, **options: Any) -> None:
@@ -91,7 +88,7 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
 def _plan(path: Path | None, screen: ScreenProfile, options: dict[str, Any]) -> _Plan:
     given = (path, options["text"], options["uri"])
     if options["payload"] is None:
-        sending = sending_of(*given, _RATES[options["mother"]], options["object_id"])
+        sending = sending_of(*given)
         n_bursts = _n_bursts(options, sending, screen)
         weights = _weights(options["weights"], screen.columns, n_bursts)
         for row in weights:
@@ -148,10 +145,9 @@ def _weights(text: str, columns: int, n_bursts: int | None = None) -> NDArray[np
 def _weight_values(text: str) -> Any:
     if not text.endswith(".json"):
         return [int(part) for part in text.split(",")]
-    try:
-        return json.loads(Path(text).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"--weights {text}: cannot be read ({error.strerror})", "name a JSON file") from None
+    with failure_explained(f"--weights {text}: cannot be read", "name a JSON file"):
+        data = Path(text).read_bytes()
+    return json.loads(data)
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,7 +42,7 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
 
     Of a clip, the first frames are received, and one is shown in full.
     """
-    folder = out if out is not None else Path(f"inspect-{_stem(path)}")
+    folder = out or Path(f"inspect-{plain_name(path).strip('._') or 'picture'}")
     page = folder / "index.html"
     claim([page_output(folder)], (path,), (), force)
     if folder.exists():  # a new one is made when there is something to put into it
@@ -89,11 +89,6 @@ def write_page(
     claim_own_folder("--out", page.parent, (page.name,), force)
     write_whole(page, text)
     return results
-
-
-def _stem(path: str) -> str:
-    """A folder's name from a file's: what any system takes."""
-    return plain_name(path).strip("._") or "picture"
 
 
 def _received(

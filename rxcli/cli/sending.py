@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import UsageError, failure_explained
 from rxcli.link.encoder import FileSending, MessageSending, RawSending, TestLight, file_object, message
 from rxcli.link.formats import MAX_MESSAGE_BYTES
 
@@ -16,9 +16,7 @@ _MAX_FILE_BYTES = 1 << 30
 LIGHT = {"lit": 4, "half": 2}
 
 
-def sending_of(
-    path: Path | None, text: str | None, uri: str | None, mother: int = 2, object_id: int | None = None
-) -> FileSending | MessageSending:
+def sending_of(path: Path | None, text: str | None, uri: str | None) -> FileSending | MessageSending:
     """The one thing that is given, ready to be sent; a text that is too long for a message goes as a file.
 
     Raises:
@@ -29,7 +27,7 @@ def sending_of(
     if len(given) != 1:
         raise UsageError(f"one of PATH, --text and --uri is needed ({len(given)} were given)", "give one of them")
     if path is not None:
-        return file_object(path.name, _bytes_of(path), object_id, mother)
+        return file_object(path.name, _bytes_of(path))
     if uri is not None:
         return message(uri, "uri")
     assert text is not None
@@ -38,7 +36,7 @@ def sending_of(
     except UnicodeEncodeError:
         raise UsageError("the text is no valid UTF-8", "send it as a file") from None
     if len(data) > MAX_MESSAGE_BYTES:
-        return file_object(_TEXT_NAME, data, object_id, mother)
+        return file_object(_TEXT_NAME, data)
     return message(data)
 
 
@@ -63,22 +61,16 @@ def payload_bytes(text: str) -> bytes | None:
     """
     if text == "random":
         return None
-    try:
+    step = "give an even number of hex digits after 'hex:', a file, or 'random'"
+    with failure_explained(f"--payload: {text} cannot be read", step, UsageError):
         data = bytes.fromhex(text[4:]) if text.startswith("hex:") else Path(text).read_bytes()
-    except ValueError:
-        raise UsageError(f"--payload: {text!r} holds no hex", "give an even number of hex digits") from None
-    except OSError as error:
-        reason = f"--payload: {text}: cannot be read ({error.strerror})"
-        raise UsageError(reason, "give 'random', 'hex:...' or a file") from None
     if not data:
         raise UsageError(f"--payload: {text!r} is empty", "give at least one byte")
     return data
 
 
 def _bytes_of(path: Path) -> bytes:
-    try:
+    with failure_explained(f"{path}: cannot be read", "name a file"):
         if path.stat().st_size > _MAX_FILE_BYTES:
             raise UsageError(f"{path} has {path.stat().st_size} bytes; at most 1 GiB can be sent", "send parts of it")
         return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})", "name a file") from None

@@ -7,7 +7,6 @@ import io
 import secrets
 import signal
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,7 @@ import click
 
 from rxcli.cli.common import options, receiver_arguments, receiver_options
 from rxcli.cli.kinds import FOLDER, Exposure
-from rxcli.errors import ExitCode, UsageError
+from rxcli.errors import ExitCode, UsageError, require
 
 if TYPE_CHECKING:
     from rxcli.web.server import Site
@@ -40,9 +39,7 @@ def serve(device: Path | None, **options: Any) -> int:
     Without --host the page can be opened on this machine alone. With --host it can be opened by whoever has the
     address that is shown, which holds a secret; a phone reads it from the QR code.
     """
-    for package in ("aiohttp", "segno"):
-        if find_spec(package) is None:
-            raise UsageError(f"the page needs the package {package}", f"pip install {package}")
+    require("the page", "aiohttp", "segno")
     asyncio.run(_run(_site(device, options)))
     click.echo("stopped", err=True)
     return ExitCode.OK

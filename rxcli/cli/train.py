@@ -1,7 +1,6 @@
 """`vlc-rx train`: fit the auto-encoder and export it."""
 
 from dataclasses import asdict
-from importlib.util import find_spec
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ import click
 
 from rxcli.cli.common import options
 from rxcli.cli.kinds import FOLDER
-from rxcli.errors import UsageError
+from rxcli.errors import require
 
 #: Samples that the ranges of eight-bit integers are laid out for.
 CALIBRATION_SAMPLES = 12
@@ -36,9 +35,7 @@ def train(out: Path, **options: Any) -> None:
     Needs the extra `train` (PyTorch on the CPU is enough). OUT gets model.onnx, model.toml and loss.png. The data sets
     and a checkpoint of the fit are kept; the same command resumes an interrupted run.
     """
-    for package in ("torch", "onnx", "matplotlib"):
-        if find_spec(package) is None:
-            raise UsageError(f"training needs {package}, which is not installed", f"pip install {package}")
+    require("training", "torch", "onnx", "matplotlib")
     from rxcli.outputs import claim_folder, claim_own_folder
 
     claim_folder("OUT", out)

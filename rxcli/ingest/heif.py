@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import InputError
+from rxcli.errors import InputError, failure_explained
 from rxcli.ingest.luma import BT601, BT709, Weights
 from rxcli.ingest.metadata import exif_metadata, turned
 from rxcli.ingest.orientation import PROBE, as_stored, orientation_of
-from rxcli.ingest.sniff import check_size, damage_explained
+from rxcli.ingest.sniff import check_size
 from rxcli.types import Metadata
 
 #: Samples a pixel of the planes by their chroma; full ones are held twice.
@@ -34,7 +34,7 @@ def read_heif(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]
         import pillow_heif
     except ImportError:
         raise InputError(f"{path}: HEIC needs pillow-heif", "run `pip install pillow-heif`, or save as JPEG") from None
-    with damage_explained(f"{path}: the HEIC picture is damaged", "copy the file again"):
+    with failure_explained(f"{path}: the HEIC picture is damaged", "copy the file again"):
         file = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
         orientation = _orientation(file[file.primary_index])
         width, height = file.size

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import InputError
+from rxcli.errors import InputError, failure_explained
 from rxcli.ingest.extent import Directories
 from rxcli.ingest.luma import BT601, THINNED, Luma, Weights, colours_of, luma_of
 from rxcli.ingest.metadata import ORIENTATION, exif_metadata, jpeg_metadata, orientation_of_tag, tiff_metadata
 from rxcli.ingest.quiet import quiet_libraries
-from rxcli.ingest.sniff import Kind, check_size, damage_explained, read_bytes, start_of_picture
+from rxcli.ingest.sniff import Kind, check_size, read_bytes, start_of_picture
 from rxcli.types import Frame, Metadata
 
 
@@ -87,7 +87,7 @@ def _read_png(data: bytes, path: Path) -> Frame:
     samples = _PNG_SAMPLES.get(colour, 4)
     held = (2 if depth == 16 else 1) * (samples + (samples > 1))  # and the luma that is made of colour
     check_size(path, width, height, held, 2 * len(data))
-    with damage_explained(f"{path}: the PNG is damaged or cut", "copy the file again"), quiet_libraries():
+    with failure_explained(f"{path}: the PNG is damaged or cut", "copy the file again"), quiet_libraries():
         pixels = imagecodecs.png_decode(data)
     return _colour_frame(path, pixels, exif_metadata(*_png_blocks(data)))
 
@@ -131,13 +131,13 @@ def _read_tiff(path: Path) -> Frame:
         if Directories(file).claims_too_much:
             raise InputError(f"{path}: the TIFF's directories claim more than the file holds", "copy it again")
         metadata = tiff_metadata(file)
-    with damage_explained(f"{path}: the TIFF is damaged or cut", "copy it again"), tifffile.TiffFile(path) as tiff:
+    with failure_explained(f"{path}: the TIFF is damaged or cut", "copy it again"), tifffile.TiffFile(path) as tiff:
         page = _picture_page(tiff)
         _check_page(page, path)
         own = orientation_of_tag(page.tags.valueof(ORIENTATION))
         metadata = replace(metadata, orientation=own or metadata.orientation)
         step = "copy it again" if page.compression == 1 else "copy it again, or save it uncompressed"
-        with damage_explained(f"{path}: the TIFF cannot be read", step):
+        with failure_explained(f"{path}: the TIFF cannot be read", step):
             pixels = page.asarray(maxworkers=1, buffersize=_READ_BYTES)
         if page.axes == "SYX":
             pixels = np.moveaxis(pixels, 0, -1)
@@ -232,7 +232,7 @@ def _read_with_pillow(data: bytes, path: Path) -> tuple[NDArray[np.uint8], Metad
     from PIL import Image
 
     with (
-        damage_explained(f"{path}: the picture is damaged", "copy the file again"),
+        failure_explained(f"{path}: the picture is damaged", "copy the file again"),
         warnings.catch_warnings(action="ignore"),  # sizes are checked here, and broken directories do no harm
         Image.open(io.BytesIO(data), formats=("AVIF", "BMP", "WEBP")) as image,
     ):

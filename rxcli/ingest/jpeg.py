@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import InputError, reason_of
+from rxcli.errors import InputError, failure_explained, reason_of
 from rxcli.ingest.luma import BT601, as_shares, luma_of, without_red
 from rxcli.ingest.quiet import quiet_libraries
-from rxcli.ingest.sniff import check_size, damage_explained
+from rxcli.ingest.sniff import check_size
 from rxcli.types import Colours, Float32Array
 
 #: What simplejpeg raises.
@@ -97,7 +97,7 @@ def decode_uncommon(data: bytes, source: object) -> tuple[NDArray[Any], float]:
     import imagecodecs
 
     header = _checked_header(data, source)
-    with damage_explained(f"{source}: cannot be decoded as JPEG", "copy the file again"):
+    with failure_explained(f"{source}: cannot be decoded as JPEG", "copy the file again"):
         if header.marker == _JPEG_LS:
             pixels = imagecodecs.jpegls_decode(data)
         else:
@@ -202,7 +202,7 @@ def _gray(data: Any, strict: bool = True) -> NDArray[np.uint8]:
 
 def _decode_odd(picture: bytes, has_end: bool, is_complete: bool, source: object) -> NDArray[np.uint8]:
     """Decode what is left of a file that is not as the standard asks; report damage, and the rows of a cut picture."""
-    with damage_explained(f"{source}: cannot be decoded as JPEG", "copy the file again"):
+    with failure_explained(f"{source}: cannot be decoded as JPEG", "copy the file again"):
         luma, fault = _with_fault(picture)
     if (has_end or is_complete) and (not fault or _is_surplus(picture, fault, has_end)):
         return luma

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rxcli.errors import failure_explained
 from rxcli.ingest.metadata import exif_metadata, turned
-from rxcli.ingest.sniff import check_size, damage_explained
+from rxcli.ingest.sniff import check_size
 from rxcli.types import Metadata
 
 _CODE = b"\xff\n"
@@ -34,7 +35,7 @@ def read_jxl(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata]:
     code = next((content[4 * (kind == b"jxlp") :] for kind, content in parts if content), data)
     width, height, orientation, bits = _header(code)
     check_size(path, width, height, _BYTES_A_PIXEL, len(data))
-    with damage_explained(f"{path}: the JPEG XL picture is damaged or cut", "copy the file again"):
+    with failure_explained(f"{path}: the JPEG XL picture is damaged or cut", "copy the file again"):
         pixels = imagecodecs.jpegxl_decode(data, index=0, keeporientation=True)
     if pixels.dtype.kind == "f":
         pixels = np.rint(np.clip(pixels, 0, 1) * np.float32(65535)).astype(np.uint16)

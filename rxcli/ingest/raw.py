@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import InputError, reason_of
+from rxcli.errors import InputError, failure_explained
 from rxcli.ingest.extent import Directories
 from rxcli.ingest.metadata import believed, merge, positive, raw_metadata, text_of
 from rxcli.ingest.quiet import quiet_libraries
@@ -41,16 +41,14 @@ def read_raw(path: Path) -> Frame:
     import rawpy
 
     _check_whole(path)
-    try:
-        raw = rawpy.imread(str(path))  # its directories only; sensor values are decoded when they are asked for
-        check_size(path, raw.sizes.raw_width, raw.sizes.raw_height, _BYTES_A_PIXEL)
-        with quiet_libraries():
-            image = raw.raw_image
-    except rawpy.LibRawFileUnsupportedError:
-        raise InputError(*_unsupported(path)) from None
-    except (rawpy.LibRawError, RuntimeError, OSError, MemoryError, ValueError) as error:
-        reason = f"{path}: the RAW file is damaged or cut ({reason_of(error)})"
-        raise InputError(reason, "copy the file again") from None
+    with failure_explained(f"{path}: the RAW file is damaged or cut", "copy the file again"):
+        try:
+            raw = rawpy.imread(str(path))  # its directories only; sensor values are decoded when they are asked for
+            check_size(path, raw.sizes.raw_width, raw.sizes.raw_height, _BYTES_A_PIXEL)
+            with quiet_libraries():
+                image = raw.raw_image
+        except rawpy.LibRawFileUnsupportedError:
+            raise InputError(*_unsupported(path)) from None
     top, left, height, width = default_crop(raw.sizes)
     pixels = image[top : top + height, left : left + width]
     if min(pixels.shape[:2]) < _PERIODS[-1]:

@@ -3,12 +3,11 @@
 import os
 import re
 import stat
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
-from rxcli.errors import InputError, reason_of
+from rxcli.errors import InputError, failure_explained, reason_of
 
 Kind = Literal["jpeg", "png", "tiff", "heif", "jxl", "other_image", "raw", "video", "device"]
 
@@ -100,13 +99,10 @@ def read_bytes(path: Path, size: int = -1) -> bytes:
     Raises:
         InputError: the system refuses.
     """
-    try:
-        with path.open("rb") as file:
-            if size < 0 and os.fstat(file.fileno()).st_size > MAX_BYTES:
-                raise InputError(f"{path}: the file has more than {MAX_BYTES / 1e9:g} GB", "save the picture smaller")
-            return file.read(size)
-    except (OSError, MemoryError) as error:
-        raise InputError(f"{path}: cannot be read ({reason_of(error)})", "check permissions and disk") from None
+    with failure_explained(f"{path}: cannot be read", "check permissions and disk"), path.open("rb") as file:
+        if size < 0 and os.fstat(file.fileno()).st_size > MAX_BYTES:
+            raise InputError(f"{path}: the file has more than {MAX_BYTES / 1e9:g} GB", "save the picture smaller")
+        return file.read(size)
 
 
 def sniff(head: bytes, suffix: str) -> Kind | None:
@@ -172,19 +168,3 @@ def check_size(source: object, width: int, height: int, bytes_a_pixel: float = 1
     if needed > MAX_BYTES:
         reason = f"{source}: {width} x {height} pixels would take {needed / 1e9:.1f} GB, more than {MAX_BYTES / 1e9:g}"
         raise InputError(reason, "save it with fewer bits a sample or in grey, if it is no bomb")
-
-
-@contextmanager
-def damage_explained(reason: str, step: str) -> Iterator[None]:
-    """Raise whatever a library raises on a damaged file, some ten unrelated types, as an input error.
-
-    Args:
-        reason: file and fault; the library's own message is added.
-        step: next step.
-    """
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"{reason} ({reason_of(error)})", step) from None

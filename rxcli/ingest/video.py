@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import InputError, reason_of
+from rxcli.errors import InputError, failure_explained, reason_of
 from rxcli.ingest.ahead import in_order, read_ahead
 from rxcli.ingest.damage import WholeFrames
 from rxcli.ingest.ends import is_cut
@@ -26,7 +26,7 @@ from rxcli.ingest.gpmf import stated_readout_s
 from rxcli.ingest.luma import BT601, BT709, THINNED
 from rxcli.ingest.metadata import believed, clip_metadata
 from rxcli.ingest.orientation import orientation_of_turn
-from rxcli.ingest.sniff import MAX_BYTES, check_size, damage_explained
+from rxcli.ingest.sniff import MAX_BYTES, check_size
 from rxcli.ingest.times import FrameTimes
 from rxcli.types import Colours, Float32Array, Frame, Metadata
 
@@ -293,7 +293,7 @@ def _frame(path: Path, frame: Any, stream: Any, progress: _Progress) -> Frame:
     time_s, nominal = _time_s(frame, stream, progress)
     metadata = Metadata(orientation=orientation_of_turn(frame.rotation))
     if not _has_luma_plane(frame.format):
-        with damage_explained(f"{path}: pixels of {frame.format.name} cannot be read", "save it as H.264 or HEVC"):
+        with failure_explained(f"{path}: pixels of {frame.format.name} cannot be read", "save it as H.264 or HEVC"):
             frame = frame.reformat(format="bgr24") if frame.format.has_palette else frame  # else grey is rounded
             frame = frame.reformat(format="gray")
     bits = frame.format.components[0].bits

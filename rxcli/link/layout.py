@@ -59,10 +59,7 @@ class BeaconLayout:
         self.places = _bits_of(unit * stride(n_labels) % n_labels, unit // n_labels)
 
 
-@lru_cache(maxsize=64)
-def beacon_layout(length: int, columns: int, payload_symbols: int, single: bool = False) -> BeaconLayout:
-    """The cached layout."""
-    return BeaconLayout(length, columns, payload_symbols, single)
+beacon_layout = lru_cache(maxsize=64)(BeaconLayout)
 
 
 def announcement_layout(columns: int, payload_symbols: int) -> BeaconLayout:

@@ -19,14 +19,10 @@ def splitmix64(seeds: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return np.asarray(z ^ (z >> np.uint64(31)))
 
 
-def splitmix64_stream(seed: int, n: int) -> NDArray[np.uint64]:
-    """First `n` outputs of SplitMix64 from the state `seed`."""
-    return splitmix64(np.uint64(seed) + np.arange(n, dtype=np.uint64) * _GAMMA)
-
-
 def whiten(data: bytes, object_id: int, block: int) -> bytes:
     """XOR `data` with the whitening sequence of a block of an object; its own inverse."""
-    words = splitmix64_stream((object_id << 32) | block, -(-len(data) // 8))
+    states = np.uint64((object_id << 32) | block) + np.arange(-(-len(data) // 8), dtype=np.uint64) * _GAMMA
+    words = splitmix64(states)
     mask = words.astype(">u8").view(np.uint8)[: len(data)]
     return (np.frombuffer(data, np.uint8) ^ mask).tobytes()
 

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rxcli.errors import UsageError
+from rxcli.errors import UsageError, failure_explained
 from rxcli.results.record import from_record
 from rxcli.results.report import plural
 from rxcli.types import FrameResult
@@ -74,17 +74,15 @@ def load_baseline(path: Path | None, min_confidence: float, slower: float) -> Ba
     Raises:
         UsageError: it cannot be read, or is none.
     """
-    baseline, place = Baseline({}, min_confidence, slower), f"--baseline {path}"
+    baseline = Baseline({}, min_confidence, slower)
     if path is None:
         return baseline
-    try:
-        with path.open(encoding="utf-8") as file:
-            for number, line in enumerate(file, start=1):
-                place = f"--baseline {path} line {number}"
-                baseline._count(from_record(json.loads(line)), baseline.earlier)
-    except OSError as error:
-        reason = f"--baseline {path}: cannot be read ({error.strerror})"
-        raise UsageError(reason, "name a file that --json wrote") from None
-    except (ValueError, RecursionError, UsageError):
-        raise UsageError(f"{place}: no result of `vlc-rx decode --json`", "name such a file") from None
+    with failure_explained(f"--baseline {path}: cannot be read", "name a file that --json wrote", UsageError):
+        lines = path.read_text(encoding="utf-8").splitlines()
+    for number, line in enumerate(lines, start=1):
+        try:
+            baseline._count(from_record(json.loads(line)), baseline.earlier)
+        except (ValueError, RecursionError, UsageError):
+            reason = f"--baseline {path} line {number}: no result of `vlc-rx decode --json`"
+            raise UsageError(reason, "name such a file") from None
     return baseline

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rxcli.errors import InputError
-from rxcli.outputs import TAPS, check_replaceable, make_parent, replacing
+from rxcli.errors import failure_explained
+from rxcli.outputs import TAPS, tapped
 from rxcli.types import BurstPosteriors, Clock, FloatArray, OnTaps, RowProfiles, SlotSamples
 
 _Stage = TypeVar("_Stage", RowProfiles, Clock, SlotSamples, BurstPosteriors)
@@ -46,7 +46,7 @@ def read_taps(path: str | Path) -> Taps:
     Raises:
         InputError: no such file, or not the taps of a photograph.
     """
-    try:
+    with failure_explained(f"{path}: not the taps of a photograph", "write them with --dump-dir"):
         with np.load(path) as file:
             arrays = dict(file)
         return Taps(
@@ -59,8 +59,6 @@ def read_taps(path: str | Path) -> Taps:
             arrays["channel.metrics"],
             _stage(arrays, "detect", BurstPosteriors),
         )
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise InputError(f"{path}: not the taps of a photograph ({error})", "write them with --dump-dir") from None
 
 
 def _stage(arrays: Mapping[str, Any], name: str, kind: type[_Stage]) -> _Stage:
@@ -92,9 +90,7 @@ def dump_stages(folder: Path, source: str, frame: int, stages: Mapping[str, Any]
     """
     arrays: dict[str, Any] = {name: array for stage, value in stages.items() for name, array in _arrays(stage, value)}
     path = folder / f"{plain_name(source)}-{frame:06d}.npz"
-    make_parent(path)
-    check_replaceable(path, TAPS, "--dump-dir")
-    with replacing(path, follow=False) as hidden:
+    with tapped(path, TAPS, "--dump-dir") as hidden:
         np.savez(hidden, **arrays)
     return path
 

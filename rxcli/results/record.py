@@ -7,7 +7,7 @@ from dataclasses import fields
 from functools import cache
 from typing import Any, TypeVar, get_type_hints
 
-from rxcli.errors import UsageError
+from rxcli.errors import UsageError, failure_explained
 from rxcli.types import ColumnResult, FrameResult, Message, ObjectProgress, PacketResult, Reason, ReceivedObject, Remark
 
 _T = TypeVar("_T")
@@ -118,7 +118,7 @@ def from_record(record: dict[str, Any]) -> FrameResult:
     """
     import numpy as np
 
-    try:
+    with failure_explained("not a result line of `vlc-rx decode --json`", "name another file", UsageError):
         screen, camera, corners = record["screen"], record["camera"], record["screen"]["corners"]
         place = {name: record[name] for name in ("source", "frame", "time_s")}
         about = {name: screen[name] for name in _OF_SCREEN if name in screen}
@@ -141,9 +141,6 @@ def from_record(record: dict[str, Any]) -> FrameResult:
             progress=tuple(_read(file, ObjectProgress) for file in under_way),
             retry=record.get("retry") is True,
         )
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-        shown = f"{error!r:.200}"
-        raise UsageError(f"not a result line of `vlc-rx decode --json` ({shown})", "name another file") from None
 
 
 def _column(record: dict[str, Any]) -> ColumnResult:

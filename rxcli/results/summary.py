@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rxcli.errors import ExitCode, UsageError, printable, worst
+from rxcli.errors import ExitCode, UsageError, printable, require, worst
 from rxcli.outputs import replacing, write_whole
 from rxcli.results import report
 from rxcli.results.report import count_packets, plural, printable_name
@@ -296,10 +296,7 @@ def check_summary_path(path: Path) -> None:
     if suffix not in (".csv", ".parquet"):
         raise UsageError(f"--summary must end in .csv or .parquet (got {str(path)!r})", "name such a file")
     if suffix == ".parquet":
-        from importlib.util import find_spec
-
-        if find_spec("pyarrow") is None:
-            raise UsageError(f"{path}: Parquet needs the package pyarrow", "pip install pyarrow, or name a .csv")
+        require(f"{path}: Parquet", "pyarrow")
 
 
 _COLUMNS = tuple(SourceSummary("").row(Limits()))

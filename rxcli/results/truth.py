@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from rxcli.errors import InputError
+from rxcli.errors import InputError, failure_explained
 from rxcli.protocol import WEIGHTS, packet_slots, payload_bits
 from rxcli.resources import read_limited
 from rxcli.types import ColumnResult, FrameResult, PacketResult
@@ -102,11 +102,8 @@ def load_truth(path: str | Path) -> Truth:
     Raises:
         InputError: it cannot be read, is no JSON, lacks a key, or contradicts itself.
     """
-    try:
+    with failure_explained(f"{path}: cannot be read as truth", "name a NAME.truth.json file"):
         truth = msgspec.json.decode(read_limited(Path(path), _MAX_BYTES), type=Truth)
-    except (OSError, ValueError, RecursionError) as error:  # msgspec's own errors are ValueErrors
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: cannot be read as truth ({reason})", "name a NAME.truth.json file") from None
     for problem in _contradictions(truth):
         raise InputError(f"{path}: {problem}", "correct the truth file")
     return truth

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.outputs import PICTURE, check_replaceable, encode_png, make_parent, write_whole
+from rxcli.outputs import PICTURE, encode_png, tapped
 from rxcli.profiles import CameraProfile, match_camera
 from rxcli.receiver.screen.geometry import lens_for
 from rxcli.results.cameras import camera_of
@@ -113,9 +113,8 @@ class UndistortedWriter:
         name = Path(frame.source).name
         name = name if len(os.fsencode(name)) <= MAX_NAME_BYTES else plain_name(name)
         path = self.folder / subfolder / f"{name}.{frame.index:05d}.png"
-        make_parent(path)
-        check_replaceable(path, PICTURE, "--save-undistorted")
-        write_whole(path, encode_png(undistorted(frame, lens)), follow=False)
+        with tapped(path, PICTURE, "--save-undistorted") as hidden:
+            hidden.write_bytes(encode_png(undistorted(frame, lens)))
         return True
 
     @staticmethod

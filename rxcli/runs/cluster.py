@@ -14,9 +14,9 @@ from tempfile import TemporaryDirectory
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-from rxcli.errors import InputError, OutputError, ReceiverError, UsageError, reason_of
+from rxcli.errors import InputError, OutputError, ReceiverError, UsageError, reason_of, require
 from rxcli.ingest.ahead import in_order
-from rxcli.outputs import PICTURE, TAPS, check_replaceable, make_parent, write_whole
+from rxcli.outputs import PICTURE, TAPS, tapped
 from rxcli.runs.batch import Decoded, Decoder, Source, unreadable
 from rxcli.types import FrameResult
 
@@ -84,10 +84,9 @@ def decode_on_cluster(
 
 
 def _connect(address: str, connect_s: float) -> Client:
-    try:
-        from distributed import Client
-    except ImportError:
-        raise UsageError("--cluster needs the package distributed", "pip install distributed") from None
+    require("--cluster", "distributed")
+    from distributed import Client
+
     made: list[Client] = []
     failures: list[str] = []
 
@@ -171,10 +170,9 @@ def _write(taps: list[_Tap], decoder: Decoder) -> None:
     """
     for place, data in taps:
         option, below = place.split(os.sep, 1)
-        path = _folders(decoder)[option] / below
-        make_parent(path)
-        check_replaceable(path, {"--dump-dir": TAPS, "--save-undistorted": PICTURE}[option], option)
-        write_whole(path, data, follow=False)
+        ours = {"--dump-dir": TAPS, "--save-undistorted": PICTURE}[option]
+        with tapped(_folders(decoder)[option] / below, ours, option) as hidden:
+            hidden.write_bytes(data)
 
 
 def _await(source: Source, future: Any, address: str) -> _Outcome | str:

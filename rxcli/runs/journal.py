@@ -17,7 +17,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any
 
-from rxcli.errors import InputError, UsageError, shortened
+from rxcli.errors import UsageError, failure_explained, shortened
 from rxcli.outputs import is_stream, replacing, unwritable
 from rxcli.results.record import from_record, to_record
 from rxcli.types import FrameResult
@@ -210,22 +210,19 @@ class Journal:
 
 def _records(path: Path) -> Iterator[tuple[bytes, dict[str, Any], FrameResult]]:
     """Line, record and result of every whole line of a journal."""
-    try:
-        with path.open("rb") as file:
-            for number, line in enumerate(file, start=1):
-                cut = line.rstrip(b"\0")[: len(_LINE_START)]  # a machine that stops leaves zeros behind it
-                if not line.endswith(b"\n") and _LINE_START.startswith(cut):
-                    return
-                try:
-                    record = json.loads(line)
-                    result = from_record(record)
-                except (ValueError, RecursionError):
-                    raise UsageError(f"{path} line {number}: not JSON of ours", _ANOTHER) from None
-                except UsageError as error:
-                    raise UsageError(f"{path} line {number}: {error.message}", _ANOTHER) from None
-                yield line, record, result
-    except OSError as error:
-        raise InputError(f"{path}: cannot be resumed ({error.strerror})", "name another file") from None
+    with failure_explained(f"{path}: cannot be resumed", "name another file"), path.open("rb") as file:
+        for number, line in enumerate(file, start=1):
+            cut = line.rstrip(b"\0")[: len(_LINE_START)]  # a machine that stops leaves zeros behind it
+            if not line.endswith(b"\n") and _LINE_START.startswith(cut):
+                return
+            try:
+                record = json.loads(line)
+                result = from_record(record)
+            except (ValueError, RecursionError):
+                raise UsageError(f"{path} line {number}: not JSON of ours", _ANOTHER) from None
+            except UsageError as error:
+                raise UsageError(f"{path} line {number}: {error.message}", _ANOTHER) from None
+            yield line, record, result
 
 
 def _check_same(path: Path, head: Head, run: object) -> None:

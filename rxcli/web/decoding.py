@@ -273,10 +273,8 @@ def _without(result: FrameResult, path: Path) -> FrameResult:
 def _check_pixels(path: Path) -> None:
     """Refuse a picture by the size in its header, before memory is allocated for it."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(path) as picture:
-                width, height = picture.size
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
+            width, height = picture.size
     except Exception:  # no picture that Pillow knows: the readers report what is wrong with it
         return
     if width * height > MAX_PIXELS:

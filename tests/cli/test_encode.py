@@ -84,7 +84,7 @@ def test_slots_are_packed_in_the_order_that_the_line_beside_them_says(tmp_path: 
         (["--text", "a", "--only-column", "2"], ExitCode.USAGE, "--only-column needs slots"),
         (["--payload", "random", "--only-column", "20"], ExitCode.USAGE, "data-34k6 has 20 columns"),
         (["--payload", "lit", "--truth", "t.json"], ExitCode.USAGE, "sends no packets"),
-        (["--payload", "hex:a"], ExitCode.USAGE, "holds no hex"),
+        (["--payload", "hex:a"], ExitCode.USAGE, "give an even number of hex digits"),
         (["--text", "a"], ExitCode.USAGE, "replace it with --force"),
     ],
 )

@@ -149,7 +149,7 @@ def test_taps_land_where_the_user_is(
     command = ["decode", "in", *names, "--quiet"]
     assert run([*command, "--dump-dir", "here/taps", "--save-undistorted", "here/straight"]) == 0
     written = []
-    monkeypatch.setattr("rxcli.runs.cluster.write_whole", lambda path, *_, **__: written.append(path))
+    monkeypatch.setattr("rxcli.runs.cluster._write", lambda taps, _decoder: written.extend(taps))
     scheduler_options = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard")
     with process("distributed.cli.dask_scheduler", *scheduler_options) as scheduler:
         address = wait_for(scheduler, r"Scheduler at:\s*(tcp://[0-9.:]+)").group(1)

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import UsageError, failure_explained
 from rxcli.ingest import KNOWN_SUFFIXES, open_source
 from rxcli.lab.benchmark import goodput
 from rxcli.lab.benchmark.cases import TWIN, Case, Record, arguments_of, bare, received, write_case
@@ -147,11 +147,9 @@ def load_journal(path: Path) -> dict[str, list[Record]]:
     if lines and not lines[-1].endswith("\n"):
         path.write_text("".join(lines := lines[:-1]), encoding="utf-8")
     for number, line in enumerate(lines, 1):
-        try:
+        with failure_explained(f"{path}: line {number} is no journal entry", "name another file"):
             entry = json.loads(line)
             found[entry["key"]] = entry["records"]
-        except (ValueError, KeyError, TypeError):
-            raise InputError(f"{path}: line {number} is no journal entry", "name another file") from None
     return found
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from rxcli.errors import UsageError
+from rxcli.errors import UsageError, failure_explained
 from rxcli.lab.simulate.scenes import Scene
 
 
@@ -213,11 +213,8 @@ def _add_stream(container: Any, encoding: Encoding, rate: Fraction, shape: tuple
     if shape[0] % 2 or shape[1] % 2:
         reason = f"{encoding.codec}: width and height must be even (got {shape[1]} x {shape[0]})"
         raise UsageError(reason, "choose another scale or size")
-    try:
+    with failure_explained(f"{settings.encoder}: this FFmpeg cannot encode it", "choose another codec", UsageError):
         stream = container.add_stream(settings.encoder, rate=rate)
-    except (av.error.FFmpegError, ValueError) as error:
-        reason = f"{settings.encoder}: this FFmpeg cannot encode it ({error})"
-        raise UsageError(reason, "choose another codec") from None
     stream.height, stream.width = shape[:2]
     stream.pix_fmt = settings.pixel_format
     context = stream.codec_context

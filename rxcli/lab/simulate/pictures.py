@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import InputError, UsageError
+from rxcli.errors import InputError, UsageError, failure_explained
 
 Picture = NDArray[np.uint8]
 #: Pictures that come inside scikit-image's own package, without a download, and their files.
@@ -62,15 +62,15 @@ def _photo_path(name: str) -> Path:
 
 
 def _read(path: Path) -> Picture:
-    from PIL import Image, ImageOps, UnidentifiedImageError
+    from PIL import Image, ImageOps
 
-    try:
-        with Image.open(path) as picture:
-            return np.asarray(ImageOps.exif_transpose(picture).convert("RGB"), np.uint8)
-    except FileNotFoundError:
-        raise UsageError(f"{path}: no such picture", f"name a file or one of: {', '.join(picture_names())}") from None
-    except (UnidentifiedImageError, OSError, ValueError) as error:
-        raise InputError(f"{path}: not a picture that can be read ({error})", "give a PNG or JPEG") from None
+    if not path.exists():
+        raise UsageError(f"{path}: no such picture", f"name a file or one of: {', '.join(picture_names())}")
+    with (
+        failure_explained(f"{path}: not a picture that can be read", "give a PNG or JPEG"),
+        Image.open(path) as picture,
+    ):
+        return np.asarray(ImageOps.exif_transpose(picture).convert("RGB"), np.uint8)
 
 
 def _fill(picture: Picture, width: int, height: int) -> Picture:

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.errors import UsageError
+from rxcli.errors import UsageError, failure_explained
 from rxcli.lab.simulate.film import Film
 from rxcli.lab.simulate.isp import Isp
 from rxcli.lab.simulate.optics import Lens, Pose, View
@@ -239,11 +239,8 @@ def with_fields(part: Part, table: Mapping[str, Any], place: str = "") -> Part:
     for name, value in table.items():
         if name not in kinds:
             raise UsageError(f"{place}{name}: no such field", f"choose from: {', '.join(kinds)}")
-        try:
-            is_part = isinstance(value, dict)
-            old = getattr(part, name)
+        with failure_explained(f"{place}{name} = {value!r}", "see docs/simulator.md", UsageError):
+            is_part, old = isinstance(value, dict), getattr(part, name)
             values[name] = with_fields(old, value, f"{name}.") if is_part else msgspec.convert(value, kinds[name])
-        except (msgspec.ValidationError, TypeError) as error:
-            raise UsageError(f"{place}{name} = {value!r}: {error}", "see docs/simulator.md") from None
     changed: Part = replace(part, **values)  # type: ignore[type-var]
     return changed
