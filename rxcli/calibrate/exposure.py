@@ -1,23 +1,19 @@
-"""Exposure from the blur of a lamp's edges: a switched lamp through an exposure is a trapezoid in every period."""
+"""Exposure from the blur of a lamp's edges."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from rxcli.calibrate.fitting import Z95
 from rxcli.calibrate.periodic import PeriodicFit, fit_periodic
+from rxcli.calibrate.waveform import BLURS_ROWS, fit_switched, lamp_wave
 from rxcli.types import FloatArray
 
-#: A trapezoid explains at least this share of the variance; its edges are at most, its plateaus at least this long,
-#: cycles. A sine is fitted best by edges of 0.35 cycles.
-_MIN_EXPLAINED, _MAX_EDGE, _MIN_PLATEAU = 0.985, 0.25, 0.1
+#: Exposures that are tried: shortest in rows, longest in periods, how many.
+_SHORTEST_ROWS, _LONGEST, _N_TRIED = 0.2, 0.25, 60
 #: Shortest edge that is not a step, rows.
 _MIN_EDGE_ROWS = 0.5
 #: Largest ratio of the file's exposure and the one that the edges give.
 _EXIF_RATIO = 1.4
-#: Bins of a period in which the fit's start is sought.
-_BINS = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +21,7 @@ class ExposureEstimate:
     """Exposure, or the reason why there is none."""
 
     exposure_s: float | None
-    #: 95 % confidence interval, from the edges' blur alone.
+    #: 95 % confidence interval; the blur of the picture may be a part of the edges.
     interval_s: tuple[float, float] | None
     comment: str
 
@@ -37,7 +33,7 @@ def estimate_exposure(
 
     A lamp that is on for `on` of every period gives, through an exposure `te`, trapezoids that rise over `min(te, on)`
     and are `max(te, on)` wide at half height. The waveform does not show which is which: the file's exposure decides;
-    without it the exposure is taken to be the shorter one.
+    without it the exposure is taken to be the shorter one. Blur of the picture widens the edges, too.
 
     Args:
         fit: the region's fit.
@@ -62,62 +58,27 @@ def _from_wave(
     fit: PeriodicFit, profile: FloatArray, line_delay_s: float, exif_exposure_s: float | None
 ) -> ExposureEstimate:
     """Exposure from values assumed proportional to light."""
-    from scipy.optimize import least_squares
-
-    usable = fit.envelope > 0.2 * fit.envelope.max()
-    wave = ((profile - fit.mean) / np.where(usable, fit.envelope, 1))[usable]
-    phase = np.asarray((fit.frequency * (fit.first_row + np.flatnonzero(usable) - fit.origin)) % 1, np.float64)
-    start = _start(phase, wave)
-    options = {"jac": "3-point", "method": "lm", "x_scale": "jac", "xtol": 1e-10}
-    shape: Any = start and least_squares(lambda state: _trapezoid(phase, state) - wave, start, **options)
-    total = max(float(np.sum((wave - wave.mean()) ** 2)), 1e-300)
-    if shape is None or 1 - float(shape.fun @ shape.fun) / total < _MIN_EXPLAINED:
+    period_s, shortest = line_delay_s / fit.frequency, min(_SHORTEST_ROWS * fit.frequency, _LONGEST / 2)
+    wave, tried = lamp_wave(fit, profile), np.geomspace(shortest, _LONGEST, _N_TRIED)
+    # The picture's blur is a part of the edges that is not known: the estimate is without, the interval with it.
+    found = fit_switched(wave, tried, BLURS_ROWS[:1])
+    blurred = fit_switched(wave, tried)
+    if not found.fits:
         return ExposureEstimate(None, None, "the lamp is not switched on and off sharply, or the picture is too noisy")
-    rise, fall, edge = (float(value) for value in shape.x[:3])
-    edge, lit = abs(edge), (fall - rise) % 1
-    variance = float(shape.fun @ shape.fun) / max(wave.size - shape.x.size, 1)
-    covariance = np.linalg.pinv(shape.jac.T @ shape.jac) * variance
-    edge_sd = float(np.sqrt(covariance[2, 2]))
-    lit_sd = float(np.sqrt(max(covariance[0, 0] + covariance[1, 1] - 2 * covariance[0, 1], 0)))
-    if edge > _MAX_EDGE or min(lit, 1 - lit) - edge < _MIN_PLATEAU:
-        return ExposureEstimate(None, None, "the stripes have no plateaus; use a slower lamp or a shorter exposure")
-    period_s = line_delay_s / fit.frequency
-    if edge < max(_MIN_EDGE_ROWS * fit.frequency, 3 * edge_sd):
-        longest = (edge + Z95 * edge_sd) * period_s
-        return ExposureEstimate(None, None, f"edges too sharp to be measured: the exposure is below {longest:.2g} s")
-    part, sd, comment = edge, edge_sd, "taken to be shorter than the lamp's flash and pause"
+    short, share, comment = found.exposure, found.share, "taken to be shorter than the lamp's flash and pause"
+    exposures = short
     if exif_exposure_s is not None:
-        parts = [(edge, edge_sd), (lit, lit_sd), (1 - lit, lit_sd)]
-        nearest = min(parts, key=lambda p: abs(np.log(p[0] * period_s / exif_exposure_s)))
-        comment = f"the file states {exif_exposure_s:.4g} s, which the edges contradict"
-        if abs(np.log(nearest[0] * period_s / exif_exposure_s)) <= np.log(_EXIF_RATIO):
-            (part, sd), comment = nearest, f"agrees with the file's {exif_exposure_s:.4g} s"
-    interval = max(part - Z95 * sd, 0.0) * period_s, (part + Z95 * sd) * period_s
-    return ExposureEstimate(part * period_s, interval, comment)
-
-
-def _start(phase: FloatArray, wave: FloatArray) -> list[float] | None:
-    """Rise, fall, edge length, low level and height from the half-height crossings of the folded wave."""
-    index = np.minimum((phase * _BINS).astype(int), _BINS - 1)
-    counts = np.bincount(index, minlength=_BINS)
-    filled = np.flatnonzero(counts)
-    if 2 * filled.size < _BINS:
-        return None
-    means = np.bincount(index, wave, _BINS)[filled] / counts[filled]
-    folded = np.interp(np.arange(_BINS), filled, means, period=_BINS)
-    low, high = np.quantile(folded, [0.02, 0.98])
-    steps = np.diff((folded > (low + high) / 2).astype(int), prepend=folded[-1] > (low + high) / 2)
-    if np.abs(steps).sum() != 2:
-        return None
-    share = float(np.mean(np.abs(folded - (low + high) / 2) < 0.35 * (high - low)))
-    edge = min(max(share / 1.4, 0.01), 0.5)
-    return [int(np.argmax(steps)) / _BINS, int(np.argmin(steps)) / _BINS, edge, float(low), float(high - low)]
-
-
-def _trapezoid(phase: FloatArray, state: FloatArray) -> FloatArray:
-    """Light at `phase`: rise and fall are ramps of one length about their middles."""
-    rise, fall, edge, low, height = state
-    lit = (fall - rise) % 1
-    # About the middle of the lit part every period has one rise on the left and one fall on the right.
-    distance = np.abs((phase - rise - lit / 2 + 0.5) % 1 - 0.5)
-    return np.asarray(low + height * np.clip(0.5 + (lit / 2 - distance) / max(abs(edge), 1e-4), 0, 1))
+        # A flash through an exposure looks like its reverse, and dark stripes look like bright ones.
+        ways = (short, share, 1 - share)
+        exposures = min(ways, key=lambda way: abs(np.log(way[0] * period_s / exif_exposure_s)))
+        comment = f"agrees with the file's {exif_exposure_s:.4g} s"
+        if abs(np.log(exposures[0] * period_s / exif_exposure_s)) > np.log(_EXIF_RATIO):
+            exposures, comment = ways[0], f"the file states {exif_exposure_s:.4g} s, which the edges contradict"
+    is_edge = exposures[0] <= _LONGEST
+    low, high = 0.99 * float(exposures.min() * period_s), 1.01 * float(exposures.max() * period_s)
+    low = min(low, float(blurred.exposure.min() * period_s)) if is_edge else low
+    if exposures[0] < _MIN_EDGE_ROWS * fit.frequency:
+        return ExposureEstimate(
+            None, (0.0, high), f"edges too sharp to be measured: the exposure is below {high:.2g} s"
+        )
+    return ExposureEstimate(float(exposures[0] * period_s), (low, high), comment)

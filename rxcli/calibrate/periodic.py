@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rxcli.calibrate.fitting import Z95
 from rxcli.types import BoolArray, FloatArray
 
 #: Oversampling of the spectrum in the search.
@@ -28,10 +29,14 @@ _PRICE = 0.01
 _LINE_POWER = 25.0
 #: Minimum number of periods, and the number from which the lines of a spectrum are separate.
 MIN_PERIODS, FEW_PERIODS = 2.0, 6
+#: Fewest strips whose scatter is a measure of an error.
+MIN_PARTS = 4
 #: Minimum score of fewer periods.
 _FEW_SCORE = 0.6
 #: Minimum explained share of fits of some numbers of periods: the fewer, the better a scene can be fitted.
-_MIN_EXPLAINED = (2, 4, FEW_PERIODS, 2 * FEW_PERIODS), (0.985, 0.97, 0.93, 0.5)
+_MIN_EXPLAINED = (2, 4, FEW_PERIODS, 2 * FEW_PERIODS), (0.98, 0.95, 0.9, 0.7)
+#: Most steps of a fit.
+_MAX_STEPS = 25
 #: Relative gain of explained variance at which a sub-harmonic is taken for the fundamental.
 _SUBHARMONIC_SHARE = 0.08
 #: Fewest periods of a candidate, whose frequency is not exact yet; and share of the strongest candidate's power from
@@ -74,15 +79,9 @@ class PeriodicFit:
         return 2 * self.n_slow + 2 * self.cosines.size
 
     def beats(self, rival: PeriodicFit) -> bool:
-        """Whether this fit is better by the Bayesian information criterion, as coloured noise allows.
-
-        The richer fit's residual gives the number of independent values; counting all of them would let harmonics
-        follow slow noise.
-        """
-        richer = self if self.n_parameters >= rival.n_parameters else rival
-        ours, theirs = (float(fit.residual @ fit.residual) + 1e-300 for fit in (self, rival))
-        gain = float(np.log(theirs / ours)) * _n_independent(richer.residual)
-        return gain > (self.n_parameters - rival.n_parameters) * float(np.log(self.mean.size))
+        """Whether this fit is better, by `_gain`."""
+        pairs = ((fit.residual, fit.n_parameters) for fit in (self, rival))
+        return _gain(*pairs) > 0
 
     def waveform(self, rows: FloatArray) -> FloatArray:
         """The periodic part at `rows`, in units of the profile where the envelope is 1."""
@@ -97,8 +96,9 @@ class PeriodicFit:
 
 def _waves(rows: FloatArray, frequency: float, n_harmonics: int) -> tuple[FloatArray, FloatArray]:
     """Cosines and sines of the harmonics at `rows` (n,), (n, H) each."""
-    angle = 2 * np.pi * frequency * np.multiply.outer(rows, np.arange(1, n_harmonics + 1))
-    return np.cos(angle), np.sin(angle)
+    turn = np.exp(2j * np.pi * frequency * rows)[:, None]
+    waves = np.cumprod(np.broadcast_to(turn, (rows.size, n_harmonics)), axis=1)
+    return waves.real, waves.imag
 
 
 def _rows_and_slow(n: int, n_slow: int) -> tuple[FloatArray, FloatArray]:
@@ -198,38 +198,73 @@ def fit_periodic(
     # A fall-off that is not followed passes for noise of long memory, in which harmonics drown.
     ample = max(terms for terms in slow_terms if terms <= _AMPLE_SLOW)
     best: PeriodicFit | None = None
-    misses = 0
-    for n_harmonics in _HARMONICS:
-        # One harmonic of a pulse may vanish; two in a row mean that there are no more.
-        if misses == 2 or (n_harmonics > 1 and n_harmonics * frequency >= 0.5):
-            break
-        fit = _fit_near(profile, frequency, n_harmonics, ample, first_row)
-        if fit is not None and (best is None or fit.beats(best)):
-            best, misses = fit, 0
-        else:
-            misses += 1
+    for n_harmonics in (1, 3):
+        if n_harmonics == 1 or n_harmonics * frequency < 0.5:
+            start = best.frequency if best else frequency
+            best = _fit_near(profile, start, n_harmonics, ample, first_row) or best
     if best is None:
         return None
-    frequency, n_harmonics = best.frequency, best.cosines.size
-    fits = [_fit_near(profile, frequency, n_harmonics, terms, first_row) for terms in slow_terms if terms != ample]
-    for fit in fits:
-        if fit is not None and fit.beats(best):
-            best = fit
+    rows, slow = _rows_and_slow(profile.size, max(slow_terms))
+    highest = max([n for n in _HARMONICS if n * best.frequency < 0.5 and 2 * n + 2 * ample < profile.size / 2] or [1])
+    waves = np.stack(_waves(rows, best.frequency, highest), axis=2).reshape(rows.size, -1) * best.envelope[:, None]
+    n_harmonics = _best_order(profile, slow[:, :ample], waves, [n for n in _HARMONICS if n <= highest], patience=2)
+    shape = best = _fit_near(profile, best.frequency, n_harmonics, ample, first_row) or best
+    wave = shape.waveform(rows + shape.origin)
+    slow_pairs = np.stack([slow, slow * wave[:, None]], axis=2).reshape(rows.size, -1)
+    orders = [n for n in slow_terms if 2 * n < profile.size / 2] or slow_terms[:1]
+    n_slow = _best_order(profile, slow_pairs[:, :0], slow_pairs, orders)
+    if n_slow != ample:
+        best = _fit_near(profile, shape.frequency, shape.cosines.size, n_slow, first_row) or shape
     if best.periods >= FEW_PERIODS:
         return best
     # Over a few periods the envelope trades against the frequency, an error that the residual does not show.
-    richer = [_fit_near(profile, frequency, n_harmonics, best.n_slow + extra, first_row) for extra in (1, 2)]
+    richer = (
+        _fit_near(profile, best.frequency, shape.cosines.size, best.n_slow + extra, first_row) for extra in (1, 2)
+    )
     deviation = max((abs(fit.frequency - best.frequency) for fit in richer if fit), default=0.0)
     return replace(best, frequency_sd=float(np.hypot(best.frequency_sd, deviation)))
+
+
+def _best_order(profile: FloatArray, fixed: FloatArray, pairs: FloatArray, orders: list[int], patience: int = 9) -> int:
+    """How many pairs of columns (n, 2 k) pay for themselves beside fixed ones, of some numbers in ascending order.
+
+    One harmonic of a pulse may vanish; `patience` such numbers in a row mean that there are no more.
+    """
+    basis = np.linalg.qr(np.hstack([fixed, pairs[:, : 2 * orders[-1]]]))[0]
+    product, n_fixed = basis.T @ profile, fixed.shape[1]
+    best, misses = (0, np.empty(0)), 0
+    for order in orders:
+        used = n_fixed + 2 * order
+        residual = profile - basis[:, :used] @ product[:used]
+        if not best[0] or _gain((residual, used), (best[1], n_fixed + 2 * best[0])) > 0:
+            best, misses = (order, residual), 0
+        elif (misses := misses + 1) == patience:
+            break
+    return best[0]
+
+
+def _gain(candidate: tuple[FloatArray, int], rival: tuple[FloatArray, int]) -> float:
+    """What a fit (residual, number of parameters) gains over a rival, by the Bayesian information criterion.
+
+    The richer fit's residual gives the number of independent values; counting all of them would let harmonics follow
+    slow noise.
+    """
+    richer = max(candidate, rival, key=lambda fit: fit[1])
+    ours, theirs = (float(residual @ residual) + 1e-300 for residual, _ in (candidate, rival))
+    gain = float(np.log(theirs / ours)) * _n_independent(richer[0])
+    return gain - (candidate[1] - rival[1]) * float(np.log(candidate[0].size))
 
 
 def _fit_near(
     profile: FloatArray, frequency: float, n_harmonics: int, n_slow: int, first_row: int
 ) -> PeriodicFit | None:
-    """Slow mean, envelope less its constant 1, harmonics and frequency, fitted together; None where it runs off."""
-    from scipy.optimize import least_squares
+    """Slow mean, envelope less its constant 1, harmonics and frequency, fitted together; None where it runs off.
 
+    Levenberg-Marquardt on the normal equations.
+    """
     n, order = profile.size, np.arange(1, n_harmonics + 1)
+    if 2 * (n_slow + n_harmonics) >= n:
+        return None
     rows, slow = _rows_and_slow(n, n_slow)
     borders = np.cumsum([n_slow, n_slow - 1, n_harmonics, n_harmonics])
 
@@ -237,29 +272,43 @@ def _fit_near(
         mean, envelope, cosines, sines, _ = np.split(state, borders)
         return slow @ mean, 1 + slow[:, 1:] @ envelope, cosines, sines, *_waves(rows, state[-1], n_harmonics)
 
-    def residual(state: FloatArray) -> FloatArray:
-        mean, envelope, a, b, cosine, sine = parts(state)
-        return mean + envelope * (cosine @ a + sine @ b) - profile
+    def residual_of(model: tuple[FloatArray, ...]) -> FloatArray:
+        mean, envelope, a, b, cosine, sine = model
+        return np.asarray(mean + envelope * (cosine @ a + sine @ b) - profile)
 
-    def jacobian(state: FloatArray) -> FloatArray:
-        _, envelope, a, b, cosine, sine = parts(state)
+    def jacobian_of(model: tuple[FloatArray, ...]) -> FloatArray:
+        _, envelope, a, b, cosine, sine = model
         wave, slope = cosine @ a + sine @ b, 2 * np.pi * rows * (cosine @ (order * b) - sine @ (order * a))
         waves = np.hstack([cosine, sine, slope[:, None]]) * envelope[:, None]
         return np.hstack([slow, slow[:, 1:] * wave[:, None], waves])
 
     flat = np.hstack([slow, *_waves(rows, frequency, n_harmonics)])
     linear = np.linalg.lstsq(flat, profile, rcond=None)[0]
-    start = np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
-    if profile.size < start.size:  # Too few rows to determine them.
+    state = np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
+    model = parts(state)
+    left, damping = residual_of(model), 1e-6
+    for _ in range(_MAX_STEPS):
+        jacobian = jacobian_of(model)
+        scale = np.linalg.norm(jacobian, axis=0) + 1e-300
+        scaled = jacobian / scale
+        normal, slope = scaled.T @ scaled, scaled.T @ left
+        step = np.linalg.solve(normal + damping * np.eye(state.size), -slope) / scale
+        tried = parts(state + step)
+        tried_left = residual_of(tried)
+        gain = float(left @ left - tried_left @ tried_left)
+        if gain > 0:
+            state, model, left, damping = state + step, tried, tried_left, max(damping / 10, 1e-12)
+        else:
+            damping = max(10 * damping, 1e-4)
+        if abs(gain) <= 1e-6 * float(left @ left):
+            break
+    if not abs(state[-1] - frequency) <= 0.6 / n:
         return None
-    found = least_squares(residual, start, jacobian, method="lm", x_scale="jac", xtol=1e-10, ftol=1e-7, max_nfev=40)
-    state, left = found.x, found.fun
-    if abs(state[-1] - frequency) > 0.6 / n:
-        return None
-    mean, envelope, cosines, sines, *_ = parts(state)
+    mean, envelope, cosines, sines, *_ = model
     trend = profile - slow @ np.linalg.lstsq(slow, profile, rcond=None)[0]
-    q, r = np.linalg.qr(found.jac)
-    influence = q[:, -1] / r[-1, -1]
+    jacobian = jacobian_of(model)
+    scaled = jacobian / (np.linalg.norm(jacobian, axis=0) + 1e-300)
+    influence = scaled @ np.linalg.pinv(scaled.T @ scaled, hermitian=True)[-1] / np.linalg.norm(jacobian[:, -1])
     return PeriodicFit(
         frequency=float(state[-1]),
         frequency_sd=_noise_sd(influence, left, state.size),
@@ -303,14 +352,38 @@ def scatter_sd(influence: FloatArray, profiles: FloatArray) -> float:
         profiles: (k, n) profiles of its strips, in order across.
 
     Returns:
-        The standard deviation, widened for its few parts; zero for fewer than four strips.
+        The standard deviation, widened for its few parts; zero for fewer than `MIN_PARTS` strips.
     """
-    if len(profiles) < 4:
+    if len(profiles) < MIN_PARTS:
         return 0.0
     parts = np.array([part.mean(axis=0) @ influence for part in np.array_split(profiles, min(8, len(profiles)))])
     # Student's 97.5 % quantile over the normal one, nearly.
     widening = 1 + 1.5 / (parts.size - 2)
     return float(np.std(parts, ddof=1) / np.sqrt(parts.size) * widening)
+
+
+def lean_bound(fit: PeriodicFit, profiles: FloatArray, width_px: float) -> float:
+    """How much stripes may lean against the rows, rows per pixel across: the far end of the 95 % interval.
+
+    Args:
+        fit: of the region's mean profile.
+        profiles: (k, n) profiles of its strips, in order across.
+        width_px: of a strip.
+    """
+    if len(profiles) < 2 * MIN_PARTS:
+        return np.inf
+    across = np.linspace(-1, 1, len(profiles))
+    rows = fit.first_row + np.arange(fit.mean.size, dtype=np.float64)
+    slope = (fit.waveform(rows + 0.25) - fit.waveform(rows - 0.25)) / 0.5
+    shapes = np.column_stack([fit.waveform(rows), slope]) * fit.envelope[:, None]
+    slow = _rows_and_slow(rows.size, fit.n_slow)[1]
+    depth, shift = np.linalg.lstsq(np.hstack([slow, shapes]), profiles.T, rcond=None)[0][-2:]
+    # The shift in rows is `shift / depth`; the edges of a round lamp, and a lens, bend both sides equally.
+    terms = depth[:, None] * across[:, None] ** np.arange(3)
+    bent = np.linalg.lstsq(terms, shift, rcond=None)[0]
+    left, freedom = shift - terms @ bent, len(profiles) - 3
+    sd = float(np.sqrt(np.linalg.pinv(terms.T @ terms)[1, 1] * (left @ left) / freedom)) * (1 + 1.5 / freedom)
+    return float(abs(bent[1]) + Z95 * sd) / ((len(profiles) - 1) * width_px / 2)
 
 
 def _n_independent(residual: FloatArray) -> float:
@@ -359,3 +432,9 @@ def longest_block(members: BoolArray) -> tuple[int, int]:
     ends = range(members.shape[1] + 1)
     ranges = [(0, 0)] + [(b0, b1) for b0 in ends for b1 in ends if b1 > b0]
     return max(ranges, key=lambda r: int(members[:, r[0] : r[1]].all(axis=1).sum()) * (r[1] - r[0]) ** 3)
+
+
+def harmonic_waves(fit: PeriodicFit, n_harmonics: int) -> FloatArray:
+    """(n, 2 K) cosines, then sines of the harmonics of a fit at its rows, under its envelope."""
+    rows = fit.first_row - fit.origin + np.arange(fit.mean.size, dtype=np.float64)
+    return np.hstack(_waves(rows, fit.frequency, n_harmonics)) * fit.envelope[:, None]

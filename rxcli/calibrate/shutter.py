@@ -9,8 +9,9 @@ lamp's region is then summed to one profile and fitted (`rxcli.calibrate.periodi
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,16 +22,25 @@ from rxcli.calibrate.periodic import FEW_PERIODS, PeriodicFit, fit_fundamental
 from rxcli.calibrate.spots import find_spots
 from rxcli.errors import ReceiverError, UsageError
 from rxcli.profiles import LensModel
-from rxcli.types import BoolArray, FloatArray
+from rxcli.types import BoolArray, FloatArray, IntArray
 
 Axis = Literal["rows", "columns"]
 Picture = NDArray[np.float32] | NDArray[np.float64]
 #: Left, top, right, bottom, stored pixels; right and bottom are outside.
 Box = tuple[int, int, int, int]
-_STRIPS = 32
+#: Strips into which the picture is cut, and a region.
+_STRIPS, _PARTS = 32, 12
 #: Fewest lines along which stripes are sought.
 _MIN_SIDE = 24
 _MAX_LAMPS = 8
+#: Share of the picture from which a lamp's stripes leave the other axis no chance.
+_ENOUGH_AREA = 0.03
+#: Share of textures taken for a lamp, where textures lie within `_TEXTURE_LEAN` radians of the lines at any angle.
+_FALSE_ALARM, _TEXTURE_LEAN = 0.01, 0.1
+#: Windows that are fitted in search of a lamp; fewest periods of a lamp in a spot.
+_MAX_TRIED, _MIN_SPOT_PERIODS = 3, 2.5
+#: Stripes that are enough wherever they are.
+ENOUGH_PERIODS = 6
 #: Logarithm of the ratio of two line delays that may still be one.
 _SAME_LINE_DELAY = 0.02
 #: Readout from which it is doubted; periods of the blocks of codecs, and the relative distance at which one is equal.
@@ -47,6 +57,8 @@ class Stripes:
     fit: PeriodicFit
     #: (n,) summed profile, picture units.
     profile: FloatArray
+    #: How much the stripes may lean against the lines, lines per pixel across; those of a lamp do not.
+    lean: float = np.inf
     #: The picture's number, and the given frequency that fits the common line delay, or None.
     picture: int = 0
     frequency_hz: float | None = None
@@ -62,6 +74,11 @@ class Stripes:
         return self.fit.frequency_sd / self.fit.frequency**2
 
     @property
+    def is_lamp(self) -> bool:
+        """Whether the stripes lie along the lines so exactly that texture does so by chance in `_FALSE_ALARM` only."""
+        return self.lean < _FALSE_ALARM * _TEXTURE_LEAN
+
+    @property
     def line_delay_s(self) -> float | None:
         """Line delay by the lamp's frequency."""
         return self.fit.frequency / self.frequency_hz if self.frequency_hz else None
@@ -70,6 +87,18 @@ class Stripes:
     def area_px(self) -> int:
         """Pixels of the region."""
         return _common_area(self.bounds, self.bounds)
+
+
+class _Candidate(NamedTuple):
+    """A window of strips and rows with its most likely frequency; the clearest is the smallest."""
+
+    few: int
+    negative_worth: float
+    frequency: float
+    strip: int
+    end_strip: int
+    start: int
+    stop: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,19 +156,24 @@ def find_stripes(picture: Picture, axis: Axis | None = None, window: Box | None 
         The axis and one region a lamp, clearest first; none where there are no stripes.
     """
     left, top, right, bottom = window = window or (0, 0, picture.shape[1], picture.shape[0])
-    boxes = find_spots(picture[top:bottom, left:right])
-    spots = [(x0 + left, y0 + top, x1 + left, y1 + top) for x0, y0, x1, y1 in boxes]
     by_axis: dict[Axis, list[Stripes]] = {}
+    in_spots: dict[Axis, int] = {}
     for along in (axis,) if axis else ("rows", "columns"):
         found = by_axis[along] = _find_in(picture, window, along)
-        for spot in spots:
+        n_whole = len(found)
+        for x0, y0, x1, y1 in find_spots(picture[top:bottom, left:right], 0 if along == "rows" else 1):
+            spot = (x0 + left, y0 + top, x1 + left, y1 + top)
             if any(2 * _common_area(spot, lamp.bounds) >= _common_area(spot, spot) for lamp in found):
                 continue
             for lamp in _find_in(picture, spot, along):
                 overlap = (5 * _common_area(lamp.bounds, s.bounds) >= min(lamp.area_px, s.area_px) for s in found)
-                if lamp.fit.periods >= FEW_PERIODS and not any(overlap):
+                if lamp.fit.periods >= _MIN_SPOT_PERIODS and not any(overlap):
                     found.append(lamp)
-    return max(by_axis.items(), key=lambda item: _evidence(item[1]))
+        in_spots[along] = len(found) - n_whole
+        if sum(lamp.area_px for lamp in found if lamp.is_lamp) > _ENOUGH_AREA * picture.size:
+            break
+    # Lamps in a line look like one lamp that blinks along it; stripes in two or more of them show that they are not.
+    return max(by_axis.items(), key=lambda item: (in_spots[item[0]] >= 2, _evidence(item[1])))
 
 
 def _common_area(box_a: Box, box_b: Box) -> int:
@@ -148,8 +182,8 @@ def _common_area(box_a: Box, box_b: Box) -> int:
 
 
 def _evidence(found: list[Stripes]) -> float:
-    """Light that the stripes explain, summed over their regions."""
-    return sum(s.area_px * s.fit.explained * float(np.std(s.profile)) for s in found)
+    """Logarithm of what the stripes leave of the variance, summed over the pixels of their regions."""
+    return sum(-s.area_px * float(np.log(max(1 - s.fit.explained, 1e-6))) for s in found)
 
 
 def _find_in(picture: Picture, box: Box, axis: Axis) -> list[Stripes]:
@@ -158,28 +192,37 @@ def _find_in(picture: Picture, box: Box, axis: Axis) -> list[Stripes]:
     upright = part if axis == "rows" else part.T
     if upright.shape[0] < _MIN_SIDE:
         return []
-    edges = np.linspace(0, upright.shape[1], min(_STRIPS, upright.shape[1]) + 1).astype(int)
-    strips = np.add.reduceat(upright, edges[:-1], axis=1, dtype=np.float64).T / np.diff(edges)[:, None]
+    edges, strips = _cut(upright, _STRIPS)
     free = np.ones(strips.shape, dtype=bool)
     found: list[Stripes] = []
-    while len(found) < _MAX_LAMPS and (lamp := _clearest_lamp(strips, free)):
+    candidates = _candidates(strips)
+    while len(found) < _MAX_LAMPS and (lamp := _clearest_lamp(strips, free, candidates)):
         members, fit, taken = lamp
         free &= ~taken
         across, top, bottom = np.flatnonzero(members), fit.first_row, fit.first_row + fit.mean.size
         left, right = int(edges[across[0]]), int(edges[across[-1] + 1])
         x0, y0, x1, y1 = (left, top, right, bottom) if axis == "rows" else (top, left, bottom, right)
         bounds = (x0 + box[0], y0 + box[1], x1 + box[0], y1 + box[1])
-        found.append(Stripes(bounds, fit, np.asarray(strips[members, top:bottom].mean(axis=0))))
+        lean = periodic.lean_bound(fit, _cut(upright[top:bottom, left:right], _PARTS)[1], (right - left) / _PARTS)
+        found.append(Stripes(bounds, fit, np.asarray(strips[members, top:bottom].mean(axis=0)), lean))
     return found
 
 
-def _clearest_lamp(strips: FloatArray, free: BoolArray) -> tuple[BoolArray, PeriodicFit, BoolArray] | None:
+def _cut(upright: Picture, n: int) -> tuple[IntArray, FloatArray]:
+    """Borders of `n` strips, fewer of a narrow picture, and (n, rows) their means."""
+    edges = np.linspace(0, upright.shape[1], min(n, upright.shape[1]) + 1).astype(int)
+    return edges, np.add.reduceat(upright, edges[:-1], axis=1, dtype=np.float64).T / np.diff(edges)[:, None]
+
+
+def _clearest_lamp(
+    strips: FloatArray, free: BoolArray, candidates: list[_Candidate]
+) -> tuple[BoolArray, PeriodicFit, BoolArray] | None:
     """The lamp with the clearest stripes among the free cells, or None.
 
     Returns:
         Its strips, the fit of its rows, and (strips, rows) all cells that follow this lamp.
     """
-    fit = _seed(strips, free)
+    fit = _seed(strips, free, candidates)
     if fit is None:
         return None
     for _ in range(2):
@@ -193,10 +236,11 @@ def _clearest_lamp(strips: FloatArray, free: BoolArray) -> tuple[BoolArray, Peri
         fit = fit_fundamental(np.asarray(strips[chosen, rows].mean(axis=0)), fit.frequency, rows.start)
         if fit is None or not fit.significant:
             return None
-        # A lamp lights its rows at once, while tiles, windows and chessboards stand beside their own negatives.
+        # A lamp lights its rows at once, in parts that can be compared; tiles, windows and chessboards stand beside
+        # their own negatives.
         upside_down = fit.periods < 2 * FEW_PERIODS and 8 * int(np.sum(shares < -0.3)) > int(members.sum())
         area = float(np.mean(chosen)) * fit.mean.size / strips.shape[1]
-        if upside_down or area < float(np.interp(fit.periods, *_MIN_AREA)):
+        if upside_down or chosen.sum() < periodic.MIN_PARTS or area < float(np.interp(fit.periods, *_MIN_AREA)):
             return None
     sd = max(fit.frequency_sd, periodic.scatter_sd(fit.influence, strips[chosen, rows]))
     taken = np.repeat(shares > 0.15, np.diff(blocks), axis=1)
@@ -204,38 +248,44 @@ def _clearest_lamp(strips: FloatArray, free: BoolArray) -> tuple[BoolArray, Peri
     return chosen, replace(fit, frequency_sd=sd), taken
 
 
-def _seed(strips: FloatArray, free: BoolArray) -> PeriodicFit | None:
-    """The best fit of the best-scoring windows: groups of neighbouring strips by spans of rows.
+def _candidates(strips: FloatArray) -> list[_Candidate]:
+    """The most likely frequency of every window (a group of neighbouring strips by a span of rows), clearest first.
 
-    A few waves are searched only where there are not many: the fall-off of a spot passes for a wave or two.
+    A few waves come last: the fall-off of a spot passes for a wave or two.
     """
-    n = strips.shape[1]
-    candidates = []
+    n, n_strips = strips.shape[1], len(strips)
+    sums = np.concatenate([np.zeros((1, n)), np.cumsum(strips, axis=0)])
+    sizes = sorted({1, 4, n_strips})
+    runs = [(at, at + size) for size in sizes for at in range(0, n_strips - size + 1, max(size // 2, 1))]
+    groups = np.array([(sums[end] - sums[at]) / (end - at) for at, end in runs]).reshape(len(runs), n)
+    found = []
     for length in (n, n // 2, n // 4):
         for start in range(0, n - length + 1, max(length // 2, 1)) if length >= _MIN_SIDE else ():
-            rows = slice(start, start + length)
-            groups = _groups(strips[:, rows], np.asarray(free[:, rows].all(axis=1)))
-            for few, (frequencies, scores) in enumerate(periodic.search(groups) if len(groups) else ()):
-                at = int(np.argmax(scores))
-                # Among equally clear windows the longer one determines the frequency better.
-                worth = float(scores[at] * np.log(length))
-                candidates.append((few, -worth, float(frequencies[at]), groups[at], start))
-    for few in (0, 1):
-        best = sorted((c[1:] for c in candidates if c[0] == few and c[1] < 0), key=lambda c: c[0])
-        for _, frequency, profile, start in best[:3]:
-            fit = fit_fundamental(profile, frequency, start)
-            if fit is not None and fit.significant:
-                return fit
+            part = groups[:, start : start + length]
+            uneven = np.flatnonzero(np.ptp(part, axis=1) > 1e-9)
+            for few, (frequencies, scores) in enumerate(periodic.search(part[uneven]) if uneven.size else ()):
+                for run, frequency, score in zip(uneven.tolist(), frequencies.tolist(), scores.tolist(), strict=True):
+                    if score > 0:
+                        # Among equally clear windows the longer one determines the frequency better.
+                        worth = score * np.log(length)
+                        found.append(_Candidate(few, -worth, frequency, *runs[run], start, start + length))
+    return sorted(found)
+
+
+def _seed(strips: FloatArray, free: BoolArray, candidates: list[_Candidate]) -> PeriodicFit | None:
+    """The first significant fit of the clearest windows that are free, one window a span of rows."""
+    tried: set[tuple[int, int, int]] = set()
+    for window in candidates:
+        span = (window.few, window.start, window.stop)
+        n_tried = sum(few == window.few for few, *_ in tried)
+        cells = slice(window.strip, window.end_strip), slice(window.start, window.stop)
+        if span in tried or n_tried == _MAX_TRIED or not free[cells].all():
+            continue
+        tried.add(span)
+        fit = fit_fundamental(strips[cells].mean(axis=0), window.frequency, window.start)
+        if fit is not None and fit.significant:
+            return fit
     return None
-
-
-def _groups(strips: FloatArray, usable: BoolArray) -> FloatArray:
-    """Means over runs of 1, 4 and all strips, where all of a run is usable and not flat."""
-    sizes = sorted({1, 4, len(strips)})
-    runs = [slice(at, at + n) for n in sizes for at in range(0, len(strips) - n + 1, max(n // 2, 1))]
-    means = [strips[run].mean(axis=0) for run in runs if usable[run].all()]
-    groups: FloatArray = np.array(means, np.float64).reshape(len(means), strips.shape[1])
-    return np.asarray(groups[np.ptp(groups, axis=1) > 1e-9])
 
 
 def _follow(strips: FloatArray, free: BoolArray, fit: PeriodicFit) -> tuple[np.ndarray, FloatArray]:
@@ -291,6 +341,11 @@ def calibrate_shutter(
     regions = [replace(s, picture=i) for i, (of, found) in enumerate(by_picture) if of == along for s in found]
     if not regions:
         where = "the picture" if len(pictures) == 1 else f"any of {len(pictures)} pictures"
+        bands = max(bands_across(picture, along) for picture in pictures for along in ((axis,) if axis else axes))
+        if bands:
+            hz = max(frequencies_hz) * ENOUGH_PERIODS / bands
+            reason = f"too few stripes in {where}: {bands} bright band{'s' * (bands > 1)} across it at most"
+            raise ReceiverError(reason, f"let the lamp blink at {hz:.2g} Hz or more, or use a slower readout")
         hint = "let the lamp fill more of the frame, expose for well below half a period, by the electronic shutter"
         raise ReceiverError(f"no stripes of a blinking lamp in {where}", f"{hint}, without HDR and flicker reduction")
     reference = _common_line_delay(regions, frequencies_hz)
@@ -315,6 +370,20 @@ def _doubts(result: ShutterCalibration, *, is_coded: bool) -> tuple[str, ...]:
         if lamp.frequency_hz and block:
             doubts.append(f"a period of {block} px is that of the blocks in which pictures and clips are coded")
     return tuple(doubts)
+
+
+def bands_across(picture: Picture, axis: Axis) -> int:
+    """Bright bands across the whole picture, as a lamp that is too slow makes them; 0 where there are none, or many."""
+    upright = picture if axis == "rows" else picture.T
+    small = cv2.resize(np.asarray(upright, np.float32), (16, 256), interpolation=cv2.INTER_AREA)
+    levels = np.log(small + 0.02)
+    common = levels.mean(axis=1)
+    uneven = levels - common[:, None] - (levels - common[:, None]).mean(axis=0)
+    if float(np.ptp(common)) < 0.3 or float(uneven.var()) > 0.1 * float(common.var()):
+        return 0
+    bright = common > (common.max() + common.min()) / 2
+    bands = int(np.sum(np.diff(bright.astype(int), prepend=0) > 0))
+    return bands if bands < ENOUGH_PERIODS else 0
 
 
 def _common_line_delay(regions: list[Stripes], frequencies_hz: Sequence[float]) -> float:

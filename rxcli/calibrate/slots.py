@@ -17,7 +17,7 @@ from rxcli.results.reasons import sentence_of
 from rxcli.types import Frame
 
 _CORRECTED = "the camera corrected its lens distortion: line delay and distortion were estimated together"
-_REVERSED = "the picture was turned upside down: a profile is of use for pictures as the camera stores them only"
+REVERSED = "the picture was turned upside down: a profile is of use for pictures as the camera stores them only"
 
 
 def calibrate_slots(frames: Sequence[Frame], screen: ScreenProfile, axis: Axis = "rows") -> ShutterCalibration:
@@ -43,7 +43,7 @@ def calibrate_slots(frames: Sequence[Frame], screen: ScreenProfile, axis: Axis =
     surest = min(bent, key=lambda estimated: estimated["k1"][1], default=confirmed[0])
     lens = camera_profile(surest, "estimated", None, None, upright[0].width, upright[0].height).lens
     is_reversed = any(estimated["readout_reversed"][0] for estimated in confirmed)
-    warnings = (_CORRECTED,) * bool(bent) + (_REVERSED,) * is_reversed
+    warnings = (_CORRECTED,) * bool(bent) + (REVERSED,) * is_reversed
     exposure = ExposureEstimate(None, None, "not estimated from data; use a lamp and --frequency")
     shape, periods = (frames[0].height, frames[0].width), upright[0].height * value * screen.slot_rate_hz
     return ShutterCalibration(axis, shape, value, sd, periods, exposure, warnings=warnings, lens=lens)

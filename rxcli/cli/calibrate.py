@@ -16,13 +16,13 @@ from rxcli.calibrate.lensfun import LensfunModel, lens_from_database
 from rxcli.calibrate.picture import write_residuals
 from rxcli.calibrate.saving import profile_to_extend, with_lens, with_mode, write_profile
 from rxcli.calibrate.shutter import ShutterCalibration, calibrate_shutter
-from rxcli.calibrate.slots import calibrate_slots
+from rxcli.calibrate.slots import REVERSED, calibrate_slots
 from rxcli.cli.common import force_argument, json_output, options, output, refuse, write_json
 from rxcli.cli.groups import SuggestingGroup
 from rxcli.cli.kinds import FILE
 from rxcli.errors import InputError, UsageError, printable
 from rxcli.ingest import KNOWN_SUFFIXES, open_source
-from rxcli.outputs import CAMERA, PICTURE, claim
+from rxcli.outputs import CAMERA, PICTURE, Output, claim, json_with
 from rxcli.profiles import NAME, CameraProfile, LensModel, ReadoutMode, ScreenProfile, load_profile
 from rxcli.resources import user_dir
 from rxcli.results.undistort import grey_levels
@@ -64,7 +64,14 @@ class _Results:
         )
         self._target: Path | None = save if name is None else user_dir() / "cameras" / f"{name}.toml"
 
-    def claim(self, read: list[Path], *json_keys: str, screen: str | None = None, picture: Path | None = None) -> None:
+    def claim(
+        self,
+        read: list[Path],
+        *json_keys: str,
+        screen: str | None = None,
+        picture: Path | None = None,
+        more: tuple[Output | None, ...] = (),
+    ) -> None:
         """Refuse outputs that would destroy something; the profile may be added to.
 
         Args:
@@ -72,10 +79,11 @@ class _Results:
             json_keys: keys of an earlier JSON of the command.
             screen: name or file of a profile that it reads.
             picture: that it writes.
+            more: further outputs.
         """
         profile = output("--save", self._target, CAMERA, makes_folder=True)
         drawn = output("--picture", picture, PICTURE)
-        claim([json_output(self._json_path, *json_keys), profile, drawn], read, (screen,), self._force)
+        claim([json_output(self._json_path, *json_keys), profile, drawn, *more], read, (screen,), self._force)
 
     def write(
         self,
@@ -218,6 +226,7 @@ def lens(paths: tuple[Path, ...], board_size: str, every: int, picture: Path | N
     ("--exposure exposure_s", float, None, "Exposure in seconds, where the files do not hold it."),
     ("--frames", click.IntRange(1), 8, "Frames used of a clip."),
     ("--mode", str, None, "Name of the readout mode to save.  [default: by the size, as 1920x1080]"),
+    ("--export", FILE, None, "Write the readout as a JSON record for other programs."),
     *_RESULTS,
 )
 @force_argument
@@ -235,7 +244,9 @@ def shutter(paths: tuple[Path, ...], frequencies: tuple[float, ...], screen: str
     window = None if region is None else _integers("--region", region, ",", "100,80,640,400")
     refuse((screen and window, "--region goes with --frequency only", "leave it out"))
     wanted, files = _Results(given), _files(paths)
-    wanted.claim(files, "readout_s", "line_delay_s", screen=screen)
+    export: Path | None = given["export"]
+    record_file = output("--export", export, json_with("format", "line_delay_s"))
+    wanted.claim(files, "readout_s", "line_delay_s", screen=screen, more=(record_file,))
     chosen = _frames(files, given["frames"])
     raw = chosen[0].mosaic is not None  # its rows are the sensor's
     along: Any = "rows" if raw or (screen and axis == "auto") else None if axis == "auto" else axis
@@ -249,7 +260,30 @@ def shutter(paths: tuple[Path, ...], frequencies: tuple[float, ...], screen: str
         click.echo(f"vlc-rx: {warning}", err=True)
     record, lines = _shutter_report(result)
     name = given["mode"]
+    if export is not None:
+        write_json(_exchanged(result, chosen[0].metadata, name), str(export))
     wanted.write(record, lines, chosen[0].metadata, lambda profile: _with_shutter(profile, result, name), result.doubts)
+
+
+def _exchanged(result: ShutterCalibration, camera: Metadata, mode: str | None) -> dict[str, Any]:
+    """The readout of one mode for other programs; a lamp does not show the direction of the readout."""
+    height, width = result.shape
+    return {
+        "format": "rolling-shutter-readout/1",
+        "make": camera.make,
+        "model": camera.model,
+        "mode": mode or f"{width}x{height}",
+        "width": width,
+        "height": height,
+        "axis": result.axis,
+        "direction": None if result.lamps else "upwards" if REVERSED in result.warnings else "downwards",
+        "lines": result.n_lines,
+        "line_delay_s": result.line_delay_s,
+        "line_delay_interval95_s": result.line_delay_interval_s,
+        "readout_s": result.readout_s,
+        "readout_interval95_s": result.readout_interval_s,
+        "warnings": [*result.warnings, *result.doubts],
+    }
 
 
 def _frames(paths: list[Path], n: int) -> list[Frame]:

@@ -30,6 +30,7 @@ _COMMANDS = {
     "live": "Texts, files and payloads of a V4L2 camera.",
     "encode": "What a screen must send: a text or a file as labels.",
     "inspect": "Pictures of every stage for one photo.",
+    "measure": "Frequency, duty and depth of lights that blink in a photo.",
     "calibrate": "Measure a lens or a shutter; writes a camera profile.",
     "simulate": "Captures with known truth, from a picture and a payload.",
     "benchmark": "Run time against error; stability.",
