@@ -138,6 +138,24 @@ def test_glare_adds_a_share_of_the_whole_picture_at_the_same_instant(small: Scen
     assert np.corrcoef(added.mean(axis=(1, 2)), exposures[0].lit[0].mean(axis=1))[0, 1] > 0.95
 
 
+def test_a_person_hides_the_screen_and_a_desk_mirrors_it(small: Scene) -> None:
+    view = replace(small.pose, fill=0.5, roll_deg=0.0, yaw_deg=0.0, pitch_deg=0.0)
+    base = replace(small, picture="white", pose=view, vignetting=0.0, lens=replace(small.lens, distortion=(0.0,) * 5))
+    base = replace(base, sensor=replace(base.sensor, cfa="rgb"), room=replace(base.room, light_e_per_s=0.0))
+
+    def light(place: tuple[float, float], **room: Any) -> float:
+        exposure = prepare(replace(base, waveform=np.ones_like, room=replace(base.room, **room)), 1).exposure()
+        x, y = np.rint(exposure.screen_to_pixels(np.array(place))).astype(int)
+        return float(render_band(exposure, 0, base.sensor.height).mean_e[y, x, 1])
+
+    person: dict[str, Any] = {"person": 0.4, "person_place": (0.3, 0.1)}
+    assert light((0.3, 0.2), **person) < 0.01 * light((0.3, 0.2))
+    assert light((0.3, 0.8), **person) < 0.01 * light((0.3, 0.8))
+    assert light((0.8, 0.8), **person) == light((0.8, 0.8))
+    assert light((0.5, 1.3), desk=0.25) == pytest.approx(0.25 * light((0.5, 0.82)), rel=0.02)
+    assert light((0.5, 1.3)) < 0.01 * light((0.5, 0.82))
+
+
 def test_rows_read_at_once_see_the_same_instant(small: Scene) -> None:
     scene = replace(small, sensor=replace(small.sensor, rows_at_once=2))
     (lit,) = prepare(scene, 1).exposure().lit

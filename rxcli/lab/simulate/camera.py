@@ -38,6 +38,9 @@ _HEIGHTS = 40
 DECAY_TIMES, _GLARE_POINTS = 8, 200
 #: Breadth of the dark frame around the panel, in screen widths.
 _BEZEL_WIDTHS = 0.035
+#: Height at which a desk mirrors the screen, screen heights from its top; a person's head, its width against the
+#: shoulders' and its height; and the share of the room's light that clothes throw back.
+_DESK_TOP, _HEAD_SHARE, _HEAD_HEIGHT, _CLOTHES = 1.06, 0.45, 0.3, 0.2
 #: Sensor pixels per panel pixel from which the three colour stripes of one can be resolved.
 _RESOLVED_PX = 1.2
 
@@ -85,6 +88,13 @@ class Exposure:
         for _ in range(_MOTION_ROUNDS):
             pixels = self.view.ideal_to_pixels(turned(at_rest, self._motion_of_rows(pixels[..., 1])))
         return pixels
+
+    def lit_places(self, pixels: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Screen places (u, v) whose light sensor places (..., 2) see, on the screen or in a desk, and its share."""
+        place = self.pixels_to_screen(pixels)
+        mirrored = (place[..., 1] > _DESK_TOP) & (self.scene.room.desk > 0)
+        place[..., 1] = np.where(mirrored, 2 * _DESK_TOP - place[..., 1], place[..., 1])
+        return place, np.where(mirrored, self.scene.room.desk, 1.0)
 
     @cached_property
     def corners(self) -> FloatArray:
@@ -219,9 +229,13 @@ class Exposure:
         Electrons of the sensor's colours per unit of green light, blurred, with a black margin around the panel.
         """
         panels = [(self.drive.transmittance,)] if self.player is None else map(self.player.panel, self.refreshes)
+        shown = 1 - _person(self.scene, *self.drive.grey.shape[:2])[..., None]
         lagging = self.scene.red_lag_share * (len(self.decays) > 1)
         kinds = np.array([[1 - lagging, 1, 1], [lagging, 0, 0]], np.float32)[: len(self.decays)]
-        return [[tuple(self._texture(light * colours) for colours in kinds) for light in lights] for lights in panels]
+        return [
+            [tuple(self._texture(light * shown * colours) for colours in kinds) for light in lights]
+            for lights in panels
+        ]
 
     def _texture(self, light: Float32Array) -> Float32Array:
         down, across = self.texture_scale
@@ -237,6 +251,19 @@ class Exposure:
         y_per_pixel = light.shape[0] * down / self.view.pixels_per_height
         sigmas = [max(sigma_px * scale, 1e-3) for scale in (x_per_pixel, y_per_pixel)]
         return np.asarray(cv2.GaussianBlur(colours, (0, 0), sigmaX=sigmas[0], sigmaY=sigmas[1]), np.float32)
+
+
+def _person(scene: Scene, height: int, width: int) -> Float32Array:
+    """(height, width) 1 where a person covers the panel, else 0."""
+    room = scene.room
+    v, u = np.mgrid[:height, :width] / [[[height]], [[width]]]
+    across, down = (
+        np.abs(u - room.person_place[0]) / max(room.person / 2, 1e-9),
+        (v - room.person_place[1]) / _HEAD_HEIGHT,
+    )
+    is_head = (across / _HEAD_SHARE) ** 2 + (2 * down - 1) ** 2 < 1
+    is_body = (across < 1) & (across**2 / 4 < down - 0.8)
+    return np.asarray((room.person > 0) * (is_head | is_body), np.float32)
 
 
 def _draw_pixel_structure(fine: Float32Array, depth: float) -> None:
@@ -262,8 +289,8 @@ def column_light(exposure: Exposure, x: FloatArray, y: FloatArray, drive: Drive)
     """
     screen = exposure.link.screen
     pixels = np.stack(np.meshgrid(x, y), axis=-1)
-    place = exposure.pixels_to_screen(pixels)
-    gain = exposure.scene.light_e_per_s * exposure.scene.exposure_s * _vignette(exposure, pixels)
+    place, share = exposure.lit_places(pixels)
+    gain = exposure.scene.light_e_per_s * exposure.scene.exposure_s * _vignette(exposure, pixels) * share
     widths = screen.light_spread, exposure.scene.spread_tails
     along = light_spread(place[..., 1], screen.segment_rows, *widths) @ drive.lit_light
     along *= light_spread(place[..., 0], screen.columns, *widths)
@@ -313,7 +340,7 @@ def render_band(exposure: Exposure, top: int, bottom: int) -> Band:
 
 def _in_texture(exposure: Exposure, x: FloatArray, y: FloatArray) -> Float32Array:
     """(ny, nx, 2) places in the texture of sensor columns (nx,) and rows (ny,)."""
-    place = exposure.pixels_to_screen(np.stack(np.meshgrid(x, y), axis=-1))
+    place, _ = exposure.lit_places(np.stack(np.meshgrid(x, y), axis=-1))
     down, across = exposure.texture_scale
     panel_height, panel_width = exposure.drive.grey.shape[:2]
     scale = np.array([panel_width * across, panel_height * down])
@@ -356,8 +383,12 @@ def _room_share(exposure: Exposure, top: int, bottom: int) -> Float32Array:
     beyond = ((np.abs(place - 0.5) - 0.5) * [1.0, 1 / screen.aspect]).max(axis=-1) * exposure.view.pixels_per_width
     bezel_px = _BEZEL_WIDTHS * exposure.view.pixels_per_width
     on_wall, off_panel = (np.clip((beyond - edge) / (2 * pitch) + 0.5, 0, 1) for edge in (bezel_px, 0.0))
-    from_lamp = (place - np.array(room.lamp_place)) * [1.0, 1 / screen.aspect]
-    panel = room.panel_reflectance + room.lamp * np.exp(-0.5 * (from_lamp**2).sum(axis=-1) / room.lamp_size**2)
+    from_lamp = np.abs((place - np.array(room.lamp_place)) * [1.0, 1 / screen.aspect]) / room.lamp_size
+    panel = room.panel_reflectance + room.lamp * np.exp(-0.5 * (from_lamp**room.lamp_edge).sum(axis=-1))
+    if room.person:
+        size = exposure.drive.grey.shape[:2]
+        at = np.clip(place[..., ::-1] * size, 0, np.array(size) - 1).astype(np.intp)
+        panel += (_CLOTHES - panel) * _person(exposure.scene, *size)[at[..., 0], at[..., 1]]
     frame = room.bezel_reflectance + (room.wall_reflectance - room.bezel_reflectance) * on_wall
     share = (panel + (frame - panel) * off_panel).astype(np.float32)
     return between_nodes(share, pitch, bottom - top, exposure.scene.sensor.width)

@@ -85,8 +85,12 @@ class Recording:
 
     @property
     def plain(self) -> "Recording":
-        """The twin: the same payloads, noise and view; a film rests, and frames stay as their rows saw them."""
-        scene = replace(self.scene, film=Film(), stabilised=False, warp=(0.0, 0.0), averaged=0.0)
+        """The twin: the same payloads, noise and view; a film rests, frames stay as their rows saw them.
+
+        Nobody stands before the screen, and nothing is mirrored.
+        """
+        room = replace(self.scene.room, person=0.0, desk=0.0, lamp=0.0)
+        scene = replace(self.scene, film=Film(), stabilised=False, warp=(0.0, 0.0), averaged=0.0, room=room)
         return replace(self, scene=scene, link=replace(self.link, weights_of=None), player=None)
 
     def exposure(self, frame: int = 0) -> Exposure:

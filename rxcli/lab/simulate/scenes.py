@@ -35,10 +35,17 @@ class Room:
     panel_reflectance: float = 0.12
     wall_reflectance: float = 0.3
     bezel_reflectance: float = 0.03
-    #: A lamp mirrored in the panel: its strength against white paper, and its place (u, v) and size (in screen widths).
+    #: A lamp mirrored in the panel: its strength against white paper, its place (u, v) and size (in screen widths), and
+    #: the exponent of its outline: 2 for a Gaussian, 20 for a window.
     lamp: float = 0.0
     lamp_place: tuple[float, float] = (0.7, 0.3)
     lamp_size: float = 0.12
+    lamp_edge: float = 2.0
+    #: Share of the screen's width that a person covers who stands before it, and the place (u, v) of their head's top.
+    person: float = 0.0
+    person_place: tuple[float, float] = (0.5, -0.4)
+    #: Share of the screen's light that a glossy desk at its foot mirrors.
+    desk: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,9 @@ def curvature_terms(x: FloatArray, rows: FloatArray, width: int, height: int) ->
 
 #: k1 k2 p1 p2 of a unit of bend: lenses bend back further out, k2 is about -k1.
 UNIT_BEND: FloatArray = np.array([1.0, -1.0, 0.0, 0.0])
+#: Inverse covariance of k1 k2 p1 p2 before the picture is seen.
+LENS_PRECISION: FloatArray = np.diag(np.array([0.3, 0.6, 1.5e-3, 1.5e-3]) ** -2.0 * [1, 0, 1, 1])
+LENS_PRECISION[:2, :2] += 0.2**-2
 
 
 def straightened(strips: ColumnStrips, level: Float32Array, curvature: FloatArray) -> Float32Array:

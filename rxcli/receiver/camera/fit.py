@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.numerics import TINY, local_mean
-from rxcli.receiver.camera.curvature import curvature_terms
+from rxcli.receiver.camera.curvature import LENS_PRECISION, curvature_terms
 from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import ColumnStrips, joined
@@ -18,9 +18,6 @@ from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
 #: Rows over which the bend is straight: of a block of the normal equations.
 _BLOCK_ROWS = 16
-#: Inverse covariance of k1 k2 p1 p2 before the picture is seen: lenses bend back further out, k2 is about -k1.
-_PRECISION: FloatArray = np.diag(np.array([0.3, 0.6, 1.5e-3, 1.5e-3]) ** -2.0 * [1, 0, 1, 1])
-_PRECISION[:2, :2] += 0.2**-2
 
 
 def settle(
@@ -54,10 +51,10 @@ def settle(
     least = hypothesis.stated_exposure_slots
     exposure, exposure_sd = max(clock.exposure_slots, least), 0.0
     straight, bent = np.array([0, 1]), np.arange(2, start.size)
-    # A longer one is known better by the changes of the light, and its rows per slot by the line of these.
+    # A longer one is known better by the changes of the light, and rows per slot and bend by the line of these.
     is_long = exposure > LONG_EXPOSURE_SLOTS
     if is_long:
-        straight = straight[:1]
+        straight, may_bend = straight[:1], False
     else:
         exposure, exposure_sd = model.exposure(start, exposure)
         exposure = max(exposure, least)
@@ -76,7 +73,7 @@ def settle(
         rows_per_slot=float(values[1]),
         rows_per_slot_sd=hypothesis.rows_per_slot_sd if is_long else float(sd[1]),
         curvature=_turned(values[2:], hypothesis),
-        curvature_sd=sd[2:],
+        curvature_sd=hypothesis.curvature_sd if is_long else sd[2:],
         exposure_slots=exposure,
         exposure_slots_sd=exposure_sd if exposure > least else 0.0,
     )
@@ -183,7 +180,7 @@ class _Model:
         )
         flat = jacobian.reshape(free.size, -1)
         prior = np.zeros((values.size, values.size))
-        prior[2:, 2:] = SETTINGS.samples_per_independent * _PRECISION
+        prior[2:, 2:] = SETTINGS.samples_per_independent * LENS_PRECISION
         prior = prior[np.ix_(free, free)]
         inverse = np.linalg.inv((flat * information.ravel()) @ flat.T + prior + TINY * np.eye(free.size))
         step = np.zeros_like(values)

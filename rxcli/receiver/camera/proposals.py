@@ -15,7 +15,7 @@ import numpy as np
 from rxcli.numerics import NORMAL_MEDIAN, TINY, folded, header_correlation, local_mean, peak_offset
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
-from rxcli.receiver.camera.curvature import UNIT_BEND, likeliest_bend, straightened
+from rxcli.receiver.camera.curvature import LENS_PRECISION, UNIT_BEND, curvature_terms, likeliest_bend, straightened
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.camera.strips import ColumnStrips, columns_of, joined, levelled
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, MAX_EXPOSURE_SLOTS, changes_over
@@ -232,18 +232,15 @@ def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_be
         exposures: stated exposure in slots by packet length, 0 for none.
         may_bend: whether the camera may have taken a distortion out.
     """
-    bends: list[FloatArray] = []
     for rows, strength, found, change in _long_exposures(strips, is_stated=any(exposures.values())):
-        # The changes of the clearest line show the bend of all.
-        bends = bends or [np.zeros(4)] + ([likeliest_bend(strips, change)] if may_bend else [])
-        for curvature in bends:
-            columns = columns_of(straightened(strips, change, curvature), strips.n_columns)
-            copies = _surprise(_autocorrelation(_from_their_tops(columns)), round(2 * SLOTS_PER_SYMBOL * rows))
-            total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
-            for length, exposure in exposures.items():
-                if rows * (length - PREAMBLE_SLOTS) <= columns.shape[1]:
-                    clock = _Clock(rows, length, strength, exposure, found)
-                    yield from _both_ways(clock, copies, total, curvature, strips.pitch)
+        rows, curvature = along_the_line(strips, rows, may_bend=may_bend)
+        columns = columns_of(straightened(strips, change, curvature), strips.n_columns)
+        copies = _surprise(_autocorrelation(_from_their_tops(columns)), round(2 * SLOTS_PER_SYMBOL * rows))
+        total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
+        for length, exposure in exposures.items():
+            if rows * (length - PREAMBLE_SLOTS) <= columns.shape[1]:
+                clock = _Clock(rows, length, strength, exposure, found)
+                yield from _both_ways(clock, copies, total, curvature, strips.pitch)
 
 
 @dataclass(frozen=True, slots=True)
@@ -350,39 +347,23 @@ def _likeness_of_changes() -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
-    """Rows a slot and how far its line stands out, by the bends of the light, likeliest first.
-
-    Whatever the exposure, light bends between slots only: where a slot comes in, and the other way where it leaves. The
-    product of both has a line at the rate of the slots, even of exposures that are not whole slots.
-    """
+    """Rows a slot and how far its line stands out, by the turns of the light, likeliest first."""
     import cv2
 
-    black = np.percentile(strips.light, SETTINGS.dark_percent)
-    light = np.log(np.maximum(strips.light - np.float32(black), np.float32(SETTINGS.min_light)))
     found: list[tuple[float, float]] = []
     for lag in SETTINGS.turn_lags:
-        fewest, most = (lag * lags for lags in SETTINGS.slot_lags)
-        nearest, furthest = int(LONG_EXPOSURE_SLOTS * fewest), int(MAX_EXPOSURE_SLOTS * most)
-        if light.shape[1] < 2 * furthest:
+        parts = _turns(strips, lag)
+        if not parts:
             continue
-        smooth = local_mean(light, max(lag // 2, 1))
-        turn = smooth[:, 2 * lag :] - 2 * smooth[:, lag:-lag] + smooth[:, : -2 * lag]
-        turn /= np.median(np.abs(turn), axis=1, keepdims=True) + np.float32(TINY)
-        turn = np.clip(turn, -SETTINGS.max_turn, SETTINGS.max_turn)
-        n = turn.shape[1]
-        columns, turns = (part.reshape(strips.n_columns, -1, n).mean(axis=1) for part in (turn, np.abs(turn)))
-        columns = _own_light(columns)
-        likeness = _autocorrelation(columns)[nearest:furthest] / np.arange(n, 0, -1)[nearest:furthest]
-        exposure = nearest + int(likeness.argmin())
-        product = np.zeros_like(columns)
-        product[:, exposure:] = -columns[:, :-exposure] * columns[:, exposure:]
+        product, turns = parts
+        size = cv2.getOptimalDFTSize(_FINE * turns.shape[1])
         # Together, and each column by itself, since the stripes of corrected pictures are bent.
-        parts = product.sum(axis=0, keepdims=True), product, turns
-        size = cv2.getOptimalDFTSize(_FINE * n)
-        spectrum = np.asarray(sum(_line_spectrum(part, lag, size) for part in parts))
+        own = product.sum(axis=0, keepdims=True), product, turns
+        spectrum = np.asarray(sum(_line_spectrum(part, lag, size) for part in own))
         frequency = np.arange(spectrum.size) / size
         # The mosaic shows as periods of two and of four rows.
         mosaic = np.minimum(np.abs(frequency - 0.25), np.abs(frequency - 0.5)) < SETTINGS.mosaic_line
+        fewest, most = (lag * lags for lags in SETTINGS.slot_lags)
         inside = (frequency > 1 / most) & (frequency < 1 / fewest) & ~mosaic
         peaks = _peaks(np.where(inside, spectrum, 0.0), SETTINGS.n_peaks, 2 * _FINE)
         found += [(float(spectrum[round(peak)]), size / peak) for peak in peaks.tolist() if peak > 0]
@@ -391,6 +372,86 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
         if len(distinct) < SETTINGS.n_peaks and not _is_among(rows, distinct):
             distinct.append((rows, strength))
     return distinct
+
+
+def _turns(strips: ColumnStrips, lag: int) -> tuple[Float32Array, ...]:
+    """What has a line at the rate of the slots: products (C, n) of turns of the light over `lag` rows, and their size.
+
+    Whatever the exposure, light turns between slots only: where a slot comes in, and the other way where it leaves. The
+    product of both has a line even of exposures that are not whole slots. Nothing where too few rows are in view.
+    """
+    black = np.percentile(strips.light, SETTINGS.dark_percent)
+    light = np.log(np.maximum(strips.light - np.float32(black), np.float32(SETTINGS.min_light)))
+    fewest, most = (lag * lags for lags in SETTINGS.slot_lags)
+    nearest, furthest = int(LONG_EXPOSURE_SLOTS * fewest), int(MAX_EXPOSURE_SLOTS * most)
+    if light.shape[1] < 2 * furthest:
+        return ()
+    smooth = local_mean(light, max(lag // 2, 1))
+    turn = smooth[:, 2 * lag :] - 2 * smooth[:, lag:-lag] + smooth[:, : -2 * lag]
+    turn /= np.median(np.abs(turn), axis=1, keepdims=True) + np.float32(TINY)
+    turn = np.clip(turn, -SETTINGS.max_turn, SETTINGS.max_turn)
+    n = turn.shape[1]
+    columns, turns = (part.reshape(strips.n_columns, -1, n).mean(axis=1) for part in (turn, np.abs(turn)))
+    columns = _own_light(columns)
+    likeness = _autocorrelation(columns)[nearest:furthest] / np.arange(n, 0, -1)[nearest:furthest]
+    exposure = nearest + int(likeness.argmin())
+    product = np.zeros_like(columns)
+    product[:, exposure:] = -columns[:, :-exposure] * columns[:, exposure:]
+    return product, turns
+
+
+def along_the_line(strips: ColumnStrips, rows: float, *, may_bend: bool) -> tuple[float, FloatArray]:
+    """Rows a slot, and the bend of the stripes, by which the turns of the light in the whole picture are in phase.
+
+    Blocks of a few slots of each column have a phase at the rate of the slots. The rate and the bend under which they
+    agree are sought on a grid and then by Newton's method, with the lens as it is before the picture is seen.
+
+    Args:
+        strips: of the picture.
+        rows: a slot, about, from `slot_lines`.
+        may_bend: whether the camera may have taken a distortion out.
+    """
+    lag = min(SETTINGS.turn_lags, key=lambda lag: abs(np.log(rows / lag / np.prod(SETTINGS.slot_lags) ** 0.5)))
+    parts = _turns(strips, lag)
+    if not parts:
+        return rows, np.zeros(4)
+    size = max(round(SETTINGS.block_slots * rows), 1)
+    n = parts[0].shape[1] // size
+    middle = lag + (np.arange(n) + 0.5) * size - 0.5
+    x = strips.x.reshape(strips.n_columns, -1, strips.rows.size).mean(axis=1)
+    at = np.rint(middle).astype(int)
+    terms = curvature_terms(x[:, at], strips.rows[at], strips.width, strips.height) / strips.pitch
+    # Of light exposed for half a slot more than whole ones the line is at twice the rate.
+    place_in_block = (np.arange(size) - (size - 1) / 2) / rows
+    blocks = []
+    for part in parts:
+        changes = (part - local_mean(part, SLOTS_PER_SYMBOL**2 * lag))[:, : n * size].reshape(len(part), n, size)
+        for order in (1, 2):
+            block = changes @ np.exp(-2j * np.pi * order * place_in_block)
+            blocks.append((order, block / np.linalg.norm(block)))
+    bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, SETTINGS.n_bends) * may_bend
+    grid = np.array([[k1, share * k1, 0, 0] for k1 in bends for share in SETTINGS.bend_shares])
+    off = np.linspace(-SETTINGS.max_off_line, SETTINGS.max_off_line, SETTINGS.n_off_line)
+    wave = np.exp(-2j * np.pi * (middle + np.tensordot(grid, terms, 1)) / rows)
+    nearby = np.exp(-2j * np.pi * middle[:, None] * off / rows)
+    score = sum(np.abs((wave**order * block).sum(axis=1) @ nearby**order) ** 2 for order, block in blocks)
+    score = score - np.einsum("bi,ij,bj->b", grid, LENS_PRECISION, grid)[:, None] / 2
+    best, shift = np.unravel_index(np.argmax(score), score.shape)
+    values = np.append((1 + off[shift]) / rows, grid[best])
+    prior, free = np.zeros((5, 5)), slice(0, 5 if may_bend else 1)
+    prior[1:, 1:] = LENS_PRECISION
+    for _ in range(SETTINGS.line_steps):
+        place = middle + np.tensordot(values[1:], terms, 1)
+        slopes = 2 * np.pi * np.concatenate([place[None], terms * values[0]])[free].reshape(-1, place.size)
+        normal, pull = prior[free, free].copy(), -(prior @ values)[free]
+        for order, block in blocks:
+            turned = (block * np.exp(-2j * np.pi * order * place * values[0])).ravel()
+            turned = turned * (2 * order * turned.sum().conj())
+            around = slopes - (slopes @ turned.real / turned.real.sum())[:, None]
+            normal += order * (around * np.maximum(turned.real, 0)) @ around.T
+            pull += around @ turned.imag
+        values[free] += np.linalg.solve(normal, pull)
+    return 1 / float(values[0]), values[1:]
 
 
 def _line_spectrum(values: Float32Array, lag: int, size: int) -> FloatArray:

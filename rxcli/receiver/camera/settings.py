@@ -61,6 +61,13 @@ class EstimateSettings(msgspec.Struct, frozen=True):
     #: Percentile of the light that counts as black; least light above it.
     dark_percent: float = 0.5
     min_light: float = 1e-4
+    #: Slots of a block whose phase is that of its middle; k2 of the bends that are tried, times k1; relative distance
+    #: of rows a slot from their line up to which they are sought, and number of distances; steps from there.
+    block_slots: float = 6.0
+    bend_shares: tuple[float, ...] = (0.0, -0.5, -1.0, -2.0)
+    max_off_line: float = 0.08
+    n_off_line: int = 321
+    line_steps: int = 12
     #: Bins around a line that it is compared with; distance of the mosaic's line, cycles a row.
     line_bins: int = 801
     mosaic_line: float = 5e-3

@@ -16,13 +16,14 @@ pattern is the sum of the log-likelihoods over strips and samples.
 The prediction of the picture needs the slots, so model and detection are iterated. The initial metrics compare every
 sample with its local extremes.
 
-`model` holds the parameters of a frame, `picture` predicts the picture, `likelihoods` computes metrics, and `patterns`
-converts slots and metrics between the frame's grid and bursts.
+`model` holds the parameters of a frame, `steady` takes off light that does not blink, `picture` predicts the picture,
+`likelihoods` computes metrics, and `patterns` converts slots and metrics between the frame's grid and bursts.
 """
 
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods
 from rxcli.receiver.channel.model import ObservationModel, estimate_black_level, estimate_tails
 from rxcli.receiver.channel.patterns import by_burst, initial_metrics, metrics_of
+from rxcli.receiver.channel.steady import without_steady_light
 
 __all__ = [
     "ObservationModel",
@@ -33,4 +34,5 @@ __all__ = [
     "initial_metrics",
     "metrics_of",
     "slot_likelihoods",
+    "without_steady_light",
 ]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import find_combs, grid_of_comb
 from rxcli.receiver.screen.courses import tilted_course
-from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_through
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.rows import find_rows
@@ -56,6 +56,9 @@ _MIN_LOG_ODDS = -7.0
 _COURSES, _SAME_COURSE = 4, 0.1
 #: Number of unlit columns at a side from which the side counts as not visible.
 _UNLIT_COLUMNS = 0.5
+#: Share of the light on the smaller side of a gap without light, its width from which perspective may miss a column,
+#: columns; coherence of lit strips; and log-odds of a unit of a grid's score.
+_MIN_BESIDE, _WIDE_GAP, _LIT_STRIP, _SCORE_ODDS = 0.03, 2.0, 0.2, 10.0
 #: Strips and a grid of their columns.
 _Placed = tuple[PictureStrips, Grid]
 
@@ -321,6 +324,7 @@ def _numbered(
     strips: PictureStrips, grid: Grid, layouts: Sequence[ColumnLayout], parts: Sequence[FloatArray] = (), rank: int = 0
 ) -> list[Outline]:
     """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
+    grid, certainty = _across_gap(strips, grid, layouts[0], parts)
     light, profile = _light_across(strips, grid, layouts[0].sigma, parts)
     stands_out = _stands_out(strips, grid)
     found: list[Outline] = []
@@ -337,6 +341,7 @@ def _numbered(
                 found.append(
                     Outline(
                         corners,
+                        certainty,
                         inferred=sides,
                         log_odds=log_odds,
                         family=family,
@@ -350,6 +355,33 @@ def _numbered(
     likeliest = max(candidate.log_odds for candidate in found)
     found = [replace(candidate, log_odds=candidate.log_odds - likeliest + rank * _SECOND) for candidate in found]
     return sorted(found, key=lambda candidate: -candidate.log_odds)
+
+
+def _across_gap(
+    strips: PictureStrips, grid: Grid, layout: ColumnLayout, parts: Sequence[FloatArray]
+) -> tuple[Grid, float]:
+    """The grid with the likeliest number of columns in its widest gap without light, and the probability of that.
+
+    Each side of a gap, as behind a person, has its own columns, and perspective bridges it to about a column.
+    """
+    start, end = strips.gap(_MIN_BESIDE)
+    if layout.is_narrow or (end - start) * strips.step * abs(grid.coefficients[1]) < _WIDE_GAP:
+        return grid, 1.0
+    number, u = np.arange(strips.x.shape[1]), columns_at(grid.coefficients, strips.x, strips.y)
+    is_left, lit = number < start, strips.coherence > _LIT_STRIP
+    beside = lit & (is_left | (number >= end))
+    grids = []
+    for more in (0, -1, 1):
+        rival = grid_through(grid, strips.x[beside], strips.y[beside], (u + more * is_left)[beside])
+        rival = moved_by_waveforms(strips, rival, layout.sigma, 2 * _FIRST_STEPS) if more else grid
+        grids.append(with_light(strips, rival, layout.sigma))
+    odds = []
+    for rival in grids:
+        _, profile = _light_across(strips, rival, layout.sigma, parts)
+        _, numbers, _ = first_columns(profile, layout.n_columns)
+        odds.append(_SCORE_ODDS * _score(rival) + np.logaddexp.reduce(numbers))
+    best = int(np.argmax(odds))
+    return grids[best], float(1 / np.exp(np.array(odds) - odds[best]).sum())
 
 
 def _light_across(

@@ -142,15 +142,20 @@ class PictureStrips:
 
     def sides_of_gap(self) -> list[PictureStrips]:
         """The strips on either side of the widest gap without coherent light, the gap in both; none without a gap."""
+        start, end = self.gap(_MIN_APART)
+        if (end - start) * self.step < _MIN_GAP_WIDTHS or self.coherence.mean() < _MIN_APART_LIGHT:
+            return []
+        return [self.blocks(np.s_[:, :end]), self.blocks(np.s_[:, start:])]
+
+    def gap(self, least: float) -> tuple[int, int]:
+        """First and last strip of the widest gap without coherent light, with a share of it of `least` on each side."""
         lit = self.coherence.mean(axis=0)
         share = np.cumsum(lit) / (lit.sum() + np.float32(TINY))
         is_dark = lit < _GAP_LIGHT * np.quantile(lit, 0.9)
-        is_dark[(share < _MIN_APART) | (share > 1 - _MIN_APART)] = False
+        is_dark[(share < least) | (share > 1 - least)] = False
         edges = np.flatnonzero(np.diff(np.concatenate([[False], is_dark, [False]]).astype(np.int8))).reshape(-1, 2)
         start, end = max(edges.tolist(), key=lambda gap: gap[1] - gap[0], default=(0, 0))
-        if (end - start) * self.step < _MIN_GAP_WIDTHS or lit.mean() < _MIN_APART_LIGHT:
-            return []
-        return [self.blocks(np.s_[:, :end]), self.blocks(np.s_[:, start:])]
+        return start, end
 
 
 def read_strips(

@@ -7,6 +7,7 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
+from rxcli.receiver.channel import without_steady_light
 from rxcli.receiver.frame.acquisition import noise_of, variants_of
 from rxcli.receiver.frame.cache import FrameCache, key_of
 from rxcli.receiver.frame.camera import FrameCamera
@@ -129,7 +130,7 @@ class Proposer:
         is_long = clock is not None and clock.exposure_slots > LONG_EXPOSURE_SLOTS
         if clock is None or clock.header_peak_ratio < (1.0 if is_long else SETTINGS.min_lead):
             return None
-        return replace(hypothesis, clock=clock, profiles=profiles)
+        return replace(hypothesis, clock=clock, profiles=without_steady_light(profiles, clock))
 
     def siblings(self, scored: Scored) -> Iterator[Hypothesis]:
         """Hypotheses that differ from a scored one in one respect, with their changed log prior."""

@@ -107,6 +107,20 @@ def test_floor_is_the_room_light(ambient: float, exposure: float) -> None:
     assert channel.estimate_black_level(samples, now) == pytest.approx(ambient, abs=0.002)
 
 
+def test_light_that_does_not_blink_is_taken_off_where_it_is() -> None:
+    link = random_link(np.random.default_rng(1), [5] * 6, 3)
+    shot_gain = Shot(texture=0.3, sigma=0.001, n_rows=1000)
+    profiles = row_profiles(link, shot_gain, np.random.default_rng(2))
+    clock = true_clock(shot_gain, link.packet_slots, 6)
+    assert np.array_equal(channel.without_steady_light(profiles, clock).light, profiles.light)
+    window = np.zeros(profiles.light.shape, np.float32)
+    window[2:4, :, :600] = 0.3
+    lighted = replace(profiles, light=profiles.light + window)
+    left = channel.without_steady_light(lighted, clock).light - profiles.light
+    assert np.abs(left[[0, 1, 4, 5]]).max() == 0
+    assert np.abs(left[2:4, :, 40:500]).mean() < 0.05
+
+
 def test_sigma_is_the_noise_of_a_dark_sample() -> None:
     """Dark parts of a picture: a tenth of the light is left."""
     for sigma in (0.0005, 0.002):

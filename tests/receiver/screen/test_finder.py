@@ -19,7 +19,7 @@ from rxcli.receiver.screen.find import (
     why_useless,
     wide_grids,
 )
-from rxcli.receiver.screen.grid import Grid, columns_at, grid_between
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_through
 from rxcli.receiver.screen.numbering import (
     WEIGHTS,
     LightProfile,
@@ -96,6 +96,8 @@ def shown(picture: str, u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArr
         return ((u > 0.13) & (u < 0.87)).astype(np.float32)
     if picture == "gap":
         return (np.abs(u - 0.47) > 0.1).astype(np.float32)
+    if picture == "person":
+        return (np.abs(u - 0.25) > 0.16).astype(np.float32)
     if picture == "dark sides":
         return ((u > 0.18) & (u < 0.86)).astype(np.float32)
     if picture == "fading":
@@ -387,6 +389,18 @@ def test_one_grid_over_a_dark_gap_is_one_screen(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(find, "wide_grids", too_narrow_at_a_side)
     (outlines,) = find_screens(plane, [WIDE])
     assert np.abs(apart(outlines[0])).max() < 0.3
+
+
+@pytest.mark.parametrize("missing", [-1, 0, 1])
+def test_the_columns_behind_a_person_are_counted_by_both_sides(missing: int) -> None:
+    strips, true = read_strips(drawn("person")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    u = columns_at(true.coefficients, strips.x, strips.y)
+    lit = strips.coherence > 0.2
+    wrong = grid_through(true, strips.x[lit], strips.y[lit], (u + missing * (u < 5))[lit])
+    grid, certainty = find._across_gap(strips, moved_by_waveforms(strips, wrong, 0.45, 6), WIDE, [])
+    off = grid.columns_at(CORNERS) - 20 * np.array([0, 1, 1, 0])
+    assert np.ptp(off) < 0.4
+    assert certainty > 0.9
 
 
 def profile_of(picture: str) -> LightProfile:
