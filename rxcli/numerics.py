@@ -67,6 +67,13 @@ def local_mean(values: Float32Array, window: int) -> Float32Array:
     return np.asarray(cv2.blur(values, (window | 1, 1)))
 
 
+def best_run(gain: FloatArray) -> tuple[int, int]:
+    """The part of `gain` (n,) with the largest sum: its first place, and the one after its last."""
+    total = np.concatenate([[0.0], np.cumsum(gain)])
+    end = int((total - np.minimum.accumulate(total)).argmax())
+    return int(total[: end + 1].argmin()), end
+
+
 def folded(values: NDArray[Any], period: int) -> NDArray[Any]:
     """(..., period) sums of values (..., n) over all periods."""
     padded = np.zeros((*values.shape[:-1], -(-values.shape[-1] // period) * period), values.dtype)

@@ -22,8 +22,6 @@ _MIN_PITCH, _MAX_PITCH, _MIN_COLUMN_STRIPS = 9.0, 46.0, 4.0
 #: Maximum turn and maximum changes of pitch across and along the columns, as shares of the pitch; step of all three at
 #: a corner of the picture, and of the columns across it, columns.
 _MAX_TURN, _MAX_ACROSS, _MAX_ALONG, _STEP = 0.12, 0.2, 0.3, 0.4
-#: Distance of the pairs of strips that show the comb of borders best, columns.
-_PAIR_DISTANCE = 0.72
 #: Combs that are tried as grids, and minimum height of a comb, standard deviations by chance.
 _N_COMBS, _MIN_COMB = 8, 6.0
 #: Combs whose pitch and whose position at the picture's ends differ by less lead to the same grid; columns.
@@ -84,15 +82,10 @@ def _all_combs(strips: PictureStrips) -> list[Comb]:
     step = strips.step * strips.n_parts
     max_pitch = min(_MAX_PITCH, 1 / (_MIN_COLUMN_STRIPS * step))
     pitches = np.arange(_MIN_PITCH, max_pitch, _STEP)
-    distances = np.maximum(np.round(_PAIR_DISTANCE / (pitches * step)), 1).astype(np.int64)
     y = strips.raw_y.mean(axis=1) * strips.n_parts
     found: list[Comb] = []
-    for distance in np.unique(distances).tolist():
-        lit_pairs = strips.coherence[:, :-distance] * strips.coherence[:, distance:]
-        tried = pitches[distances == distance]
-        rest = np.sqrt(lit_pairs) * strips.coherence_at(distance)
-        # Where light spreads far, pairs have more in common; taken off too little, it looks like few wide columns.
-        rest -= np.vdot(rest, lit_pairs) / (np.vdot(lit_pairs, lit_pairs) + np.float32(TINY)) * lit_pairs
+    for chosen, pairs, lit_pairs in strips.borders(pitches * strips.n_parts):
+        tried, rest = pitches[chosen], pairs[:, 0]
         chance = np.sqrt(float(lit_pairs.sum()) / (2 * strips.n_rows)) + TINY
         # Pairs across a border are less coherent. Combs are scaled to their standard deviation by chance, so that
         # different distances can be compared.

@@ -17,8 +17,6 @@ from rxcli.types import Float32Array, FloatArray
 #: Parts of a window of rows, in which columns hardly lean; parts of the picture across and down, and standard deviation
 #: of a part's Gaussian weight, in widths of a part.
 _SUBWINDOWS, _TILES, _TILE_SD = 4, 4, 0.5
-#: Distance of the pairs of strips that show borders best, columns.
-_PAIR_DISTANCE = 0.72
 #: Borders per picture width across and down.
 _ACROSS, _DOWN = np.arange(5.0, 63.0, 2.0), np.arange(-60.0, 61.0, 2.0)
 #: Columns that are tried, and steps and largest values of turn and perspective: 50 degrees of roll, and 45 of yaw.
@@ -68,20 +66,11 @@ def _tried() -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
 
 def _spectra(strips: PictureStrips) -> tuple[Float32Array, FloatArray]:
     """Spectra (T, across, down) of the borders in parts of a picture, over noise, and the parts' middles (T, 2)."""
-    n_windows, n_strips, n_rows = strips.changes.shape
-    rows = n_rows // _SUBWINDOWS
-    changes = strips.changes[..., : rows * _SUBWINDOWS].reshape(n_windows, n_strips, _SUBWINDOWS, rows)
     start = ((np.arange(_SUBWINDOWS) + 0.5) / _SUBWINDOWS * 2 - 1) * strips.half_height
     y = (strips.raw_y[:, :1] + start).ravel()
     middles_y, down = _waves(y, y[-1] - y[0] + y[1] - y[0], _DOWN)
-    distances = np.maximum(np.round(_PAIR_DISTANCE / (_ACROSS * strips.step)), 1).astype(np.int64)
     spectra = np.empty((_TILES, _TILES, _ACROSS.size, _DOWN.size), np.float32)
-    for distance in np.unique(distances).tolist():
-        chosen = distances == distance
-        lit = strips.coherence[:, :-distance] * strips.coherence[:, distance:]
-        pairs = np.einsum("wskr,wskr->wks", changes[:, :-distance], changes[:, distance:])
-        rest = np.sqrt(lit)[:, None] * pairs
-        rest -= (np.vdot(rest.sum(axis=1), lit) / (_SUBWINDOWS * np.vdot(lit, lit) + TINY)) * lit[:, None]
+    for chosen, rest, _ in strips.borders(_ACROSS, _SUBWINDOWS):
         x = (np.arange(rest.shape[2]) - (rest.shape[2] - 1) / 2) * strips.step
         middles_x, across = _waves(x, 1.0, _ACROSS[chosen])
         in_rows = np.tensordot(rest.reshape(y.size, -1), across, (1, 1))

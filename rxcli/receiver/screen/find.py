@@ -31,8 +31,9 @@ MIN_SIZE_PX, MAX_TALL, _MIN_STRIPS = 96, 6, 120
 _NARROW_COLUMNS, _PARTS = 50, 5
 #: Factor by which the followed width of a grid of narrow columns grows at a time.
 _REACH_GAIN = 1.4
-#: Steps of a grid on some of the windows, and last steps on all windows.
-_FIRST_STEPS, _LAST_STEPS = 3, 2
+#: Steps of a grid on some of the windows, and last steps on all windows; times that the course of columns which lean is
+#: followed.
+_FIRST_STEPS, _LAST_STEPS, _COURSES = 3, 2, 2
 #: Contrast of the strongest comb, as a share of the light it explains, from which no further combs are tried; number of
 #: combs that are fitted otherwise.
 _PLAIN_CONTRAST, _N_FITTED = 0.22, 3
@@ -52,8 +53,6 @@ _POSSIBLE_CONTRAST = 0.5
 _NEARLY_BEST, _SECOND, _DIFFERENT = 0.3, -25.0, 0.2
 #: Log-odds relative to the likeliest first column down to which another one is possible.
 _MIN_LOG_ODDS = -7.0
-#: Most rounds in which the course of columns that lean is found, and its change that ends them.
-_COURSES, _SAME_COURSE = 4, 0.1
 #: Number of unlit columns at a side from which the side counts as not visible.
 _UNLIT_COLUMNS = 0.5
 #: Share of the light on the smaller side of a gap without light, its width from which perspective may miss a column,
@@ -119,6 +118,12 @@ def shows_narrow(plane: LightPlane) -> bool:
     """Whether the columns in a picture are narrow."""
     strips = _strips_of(plane, None)
     return strips is not None and shows_narrow_columns(strips.without_common_light())
+
+
+def striped_box(plane: LightPlane) -> FloatArray | None:
+    """See `PictureStrips.striped_box`."""
+    strips = _strips_of(plane, None)
+    return None if strips is None else strips.striped_box()
 
 
 def _strips_of(plane: LightPlane, lens: Lens | None) -> PictureStrips | None:
@@ -235,17 +240,15 @@ def _starts(strips: PictureStrips, quiet: PictureStrips, sigma: float) -> list[_
 
 
 def _leaning_starts(along: Callable[[Course], PictureStrips], course: Course, sigma: float) -> list[_Placed]:
-    """The best grids about a course of the columns, and about that of the best grid in turn."""
+    """Grids of the strongest combs about a course of the columns, and about that of the best of them in turn."""
     found: list[_Placed] = []
     for _ in range(_COURSES):
-        strips, before = along(course), course
-        some = _half(strips)
-        for _, grid in _starts(strips, strips.without_common_light(), sigma):
-            found.append((strips, with_light(some, moved_by_waveforms(some, grid, sigma, _FIRST_STEPS), sigma)))
+        strips = along(course)
+        for _, start in _starts(strips, strips.without_common_light(), sigma):
+            grid = moved_by_waveforms(_half(strips), start, sigma, _FIRST_STEPS)
+            found.append((strips, with_light(_half(strips), grid, sigma)))
         found = sorted(found, key=lambda own: -_score(own[1]))[:_N_FITTED]
         course = found[0][1].course if found else course
-        if course.distance(before) < _SAME_COURSE:
-            break
     return found
 
 
@@ -258,10 +261,10 @@ def _fitted(
     strips: PictureStrips, grid: Grid, sigma: float, along: Callable[[Course], PictureStrips] | None
 ) -> _Placed:
     """A grid moved to its columns; strips that lean are read anew along them."""
-    grid, n_steps = moved_by_waveforms(_half(strips), grid, sigma, _FIRST_STEPS), _LAST_STEPS
+    grid = moved_by_waveforms(_half(strips), grid, sigma, _FIRST_STEPS)
     if along and strips.course != UPRIGHT:
-        strips, n_steps = along(grid.course), _FIRST_STEPS
-    return strips, with_light(strips, moved_by_waveforms(strips, grid, sigma, n_steps), sigma)
+        strips = along(grid.course)
+    return strips, with_light(strips, moved_by_waveforms(strips, grid, sigma, _LAST_STEPS), sigma)
 
 
 def _likelihood(grid: Grid) -> float:

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from rxcli.numerics import TINY
+from rxcli.numerics import TINY, best_run
 from rxcli.receiver.screen.grid import Grid, columns_at
 from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.resources import data_dir
@@ -25,6 +25,9 @@ _PARTS, _BESIDE = 8, 3
 _SURE, _BLACK, _LIT_ROWS = 4.0, 4.0, 0.2
 #: Light of one grey level of 255; maximum log-odds by which a part that never goes out is no column.
 _GREY_LEVEL, _MAX_STEADY = 255.0**-2, 2.0
+#: Columns to either side of the picture's middle one that are looked at: on a plane seen nearly edge-on there are any
+#: number.
+_FURTHEST = 200
 #: Mean light of parts that belong to the light; columns of the picture that must lie beyond light which ends in it.
 _ENDS, _IN_VIEW = 0.15, 0.3
 #: Share of the parts that are the darkest, or the brightest; parts are faint up to a share of the way from these to
@@ -35,8 +38,6 @@ _SIDE_SD = 0.0125
 #: Distances from the screen's middle, screen widths, within which edges lie that it has in pairs: of films and of the
 #: screen's frame.
 _PAIRED = (0.22, 0.58)
-
-
 #: Columns that a picture shows of a screen, where it has as many.
 _MIN_SHOWN = 3
 
@@ -84,9 +85,7 @@ class LightProfile:
     @property
     def ends(self) -> tuple[float, float]:
         """Columns at which the light begins and ends."""
-        gain = np.concatenate([[0.0], np.cumsum(self.light - _ENDS)])
-        end = int((gain - np.minimum.accumulate(gain)).argmax())
-        start = int(gain[: end + 1].argmin())
+        start, end = best_run(self.light - _ENDS)
         left = float(self.place[0]) - 0.5 / _PARTS
         return left + start / _PARTS, left + end / _PARTS
 
@@ -112,6 +111,7 @@ def light_profile(
         parts: corners (4, 2) of bright parts of the picture, clockwise from the top left.
     """
     u = columns_at(grid.coefficients, strips.x, strips.y)
+    u = np.clip(u, np.median(u) - _FURTHEST, np.median(u) + _FURTHEST)
     origin = int(np.floor(u.min())) - 1
     n = (int(np.ceil(u.max())) + 1 - origin) * _PARTS
     part = ((u - origin) * _PARTS).astype(np.int64)

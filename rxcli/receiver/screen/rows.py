@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.numerics import TINY
+from rxcli.numerics import TINY, best_run
 from rxcli.receiver.screen.grid import Grid, columns_at, straightened
 from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import Float32Array, FloatArray
@@ -134,13 +134,11 @@ def lit_range(v: FloatArray, light: FloatArray) -> tuple[float, float]:
     """Beginning and end of the light, at most one screen apart."""
     step = float(v[1] - v[0])
     full = max(float(np.percentile(light[light != 0], 75)), TINY) if light.any() else TINY
-    gain = np.concatenate([[0.0], np.cumsum(np.minimum(light, full) - _LIT_SHARE * full)])
-    n = min(round(1 / step), light.size)
-    end = int((gain - np.minimum.accumulate(gain)).argmax())
-    start = int(gain[: end + 1].argmin())
+    gain, n = np.minimum(light, full) - _LIT_SHARE * full, min(round(1 / step), light.size)
+    start, end = best_run(gain)
     if end - start > n:
         # The band pass smears light beyond both ends: use the middle of the positions that hold nearly all of it.
-        held = gain[n:] - gain[:-n]
+        held = np.convolve(gain, np.ones(n), "valid")
         start = round(float(np.flatnonzero(held > _NEARLY_ALL * held.max()).mean()))
         end = start + n
     return float(v[0] + (start - 0.5) * step), float(v[0] + (end - 0.5) * step)

@@ -8,6 +8,7 @@ fifth of the picture's width has finer strips and its own blocks; everything aft
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen import geometry
-from rxcli.types import Float32Array, FloatArray, Lens, LightPlane
+from rxcli.types import BoolArray, Float32Array, FloatArray, Lens, LightPlane
 
 #: Strips across the picture, and across each part of a picture with narrow columns; windows of rows.
 _N_STRIPS, _N_PART_STRIPS, _N_WINDOWS = 200, 150, 16
@@ -30,12 +31,16 @@ _NEAR_WIDTHS, _FAR_WIDTHS, _NARROW_RATIO = 0.004, 0.01, 0.72
 #: Two screens lie apart if strips between them have less than this share of the light, over this many picture widths;
 #: share of the light that each has, and mean coherence of all strips, at least.
 _GAP_LIGHT, _MIN_GAP_WIDTHS, _MIN_APART, _MIN_APART_LIGHT = 0.25, 0.015, 0.2, 0.1
+#: Power of stripes that belong to a box, of the clearest; windows and strips without stripes that it bridges.
+_STRIPED, _BRIDGED = 0.05, (3, 21)
+#: Distance of the pairs of strips that show borders best, columns.
+_PAIR_DISTANCE = 0.72
 #: Averaged rows whose mean the band pass takes off.
 LONG_ROWS = 8
 #: Share of a strip's power that may be due to rounding.
 ROUNDING = np.float32(1e-6)
 #: Arrays by block and strip.
-_OF_STRIPS = ("changes", "coherence", "level", "darkest", "raw_x", "raw_y", "x", "y")
+_OF_STRIPS = ("changes", "coherence", "stripes", "level", "darkest", "raw_x", "raw_y", "x", "y")
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,10 +53,6 @@ class Course:
     turn: float = 0.0
     g: float = 0.0
     h: float = 0.0
-
-    def distance(self, course: Course) -> float:
-        """Largest difference in turn and perspective."""
-        return max(abs(self.turn - course.turn), abs(self.g - course.g), abs(self.h - course.h))
 
     def across(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """(...) place across the columns, picture widths at its middle."""
@@ -78,6 +79,8 @@ class PictureStrips:
     changes: Float32Array
     #: (B, S) float32: coherence of each strip's neighbours, 0..1, the share of its variance that is the columns'.
     coherence: Float32Array
+    #: (B, S) float32: power of what a strip's neighbours have in common, row noise included; 0 where that is little.
+    stripes: Float32Array
     #: (B, S) float32: mean light and that at the darkest instant, roughly linear, of white.
     level: Float32Array
     darkest: Float32Array
@@ -119,10 +122,30 @@ class PictureStrips:
         """Distance of two neighbouring strips, picture widths."""
         return float(self.raw_x[0, 1] - self.raw_x[0, 0])
 
-    def coherence_at(self, distance: int) -> Float32Array:
-        """(B, S - distance) coherence of strips with those `distance` strips to their right."""
-        pairs = np.einsum("bsr,bsr->bs", self.changes[:, :-distance], self.changes[:, distance:])
-        return np.asarray(pairs / np.float32(self.changes.shape[2]), np.float32)
+    def coherence_at(self, distance: int, n_parts: int = 1) -> Float32Array:
+        """(B, n_parts, n) coherence of strips with those `distance` strips to their right, in parts of the rows."""
+        rows = self.changes.shape[2] // n_parts
+        parts = self.changes[..., : rows * n_parts].reshape(*self.changes.shape[:2], n_parts, rows)
+        pairs = np.einsum("bskr,bskr->bks", parts[:, :-distance], parts[:, distance:])
+        return np.asarray(pairs / np.float32(max(rows, 1)), np.float32)
+
+    def borders(self, pitches: FloatArray, n_parts: int = 1) -> Iterator[tuple[BoolArray, Float32Array, Float32Array]]:
+        """Pairs of strips that show borders: how much more coherent than pairs of as much light, and their light.
+
+        Args:
+            pitches: (P,) columns per picture width.
+            n_parts: parts of the rows of a block.
+
+        Yields:
+            Which of the pitches (P,), (B, n_parts, n) of pairs that show those best, and (B, n).
+        """
+        distances = np.maximum(np.round(_PAIR_DISTANCE / (pitches * self.step)), 1).astype(np.int64)
+        for distance in np.unique(distances).tolist():
+            lit = self.coherence[:, :-distance] * self.coherence[:, distance:]
+            rest = np.sqrt(lit)[:, None] * self.coherence_at(distance, n_parts)
+            # Where light spreads far, pairs have more in common; taken off too little, it looks like few wide columns.
+            rest -= (np.vdot(rest.mean(axis=1), lit) / (np.vdot(lit, lit) + np.float32(TINY))) * lit[:, None]
+            yield distances == distance, rest, lit
 
     def without_common_light(self) -> PictureStrips:
         """The same without the light that all columns share, as of headers and lamps: it shows no borders."""
@@ -139,6 +162,21 @@ class PictureStrips:
     def part(self, number: int) -> PictureStrips:
         """The blocks of one part of the width."""
         return self.blocks(slice(number * self.n_windows, (number + 1) * self.n_windows))
+
+    def striped_box(self) -> FloatArray | None:
+        """Corners (4, 2), pixels, of the upright rectangle around the largest part with stripes; None without."""
+        import cv2
+
+        is_striped = (self.stripes > _STRIPED * float(np.quantile(self.stripes, 0.99))).astype(np.uint8)
+        is_striped = cv2.morphologyEx(is_striped, cv2.MORPH_CLOSE, np.ones(_BRIDGED, np.uint8))
+        parts = cv2.connectedComponentsWithStats(is_striped)[2][1:]
+        if not len(parts):
+            return None
+        left, top, across, down, _ = max(parts.tolist(), key=lambda part: part[-1])
+        x = self.raw_x[0, [left, left + across - 1]] + self.step / 2 * np.array([-1, 1])
+        y = self.raw_y[[top, top + down - 1], 0] + self.half_height * np.array([-1, 1])
+        box = np.array([[x[0], y[0]], [x[1], y[0]], [x[1], y[1]], [x[0], y[1]]])
+        return np.asarray(box * self.width + (np.array([self.width, self.height]) - 1) / 2)
 
     def sides_of_gap(self) -> list[PictureStrips]:
         """The strips on either side of the widest gap without coherent light, the gap in both; none without a gap."""
@@ -181,7 +219,7 @@ def read_strips(
         windows = _windows_along(plane, x, middles, n_rows * short, margin, course)
         means, band = (part.reshape(len(light), -1) for part in _band_passed(windows, short, n_rows, margin))
     points = np.stack(np.meshgrid(x, middles), axis=-1)
-    changes, lit, noise = _without_row_noise(_windows(band, n_windows))
+    changes, lit, stripes, noise = _without_row_noise(band.reshape(len(band), n_windows, -1).swapaxes(0, 1))
 
     def parted(values: NDArray[Any]) -> NDArray[Any]:
         """(W, S, ...) as (parts x W, S / parts, ...)."""
@@ -192,7 +230,7 @@ def read_strips(
     by_window = means.reshape(x.size, n_windows, n_rows)
     level = _roughly_linear(plane, by_window.mean(axis=2).T)
     darkest = _roughly_linear(plane, by_window.min(axis=2).T)
-    of_strips: list[NDArray[Any]] = [changes, lit, level, darkest, *stored, *flat]
+    of_strips: list[NDArray[Any]] = [changes, lit, stripes, level, darkest, *stored, *flat]
     return PictureStrips(
         **{name: parted(values) for name, values in zip(_OF_STRIPS, of_strips, strict=True)},
         half_height=n_rows * short / 2 / plane.width,
@@ -265,7 +303,7 @@ def _lit_coherence(strips: PictureStrips, widths: float) -> float:
     """Mean coherence of lit strips `widths` picture widths apart, relative to that within one column."""
     distance = max(round(widths / strips.step), 1)
     share = np.sqrt(strips.coherence[:, :-distance] * strips.coherence[:, distance:])
-    return float((strips.coherence_at(distance) * share).sum() / (np.square(share).sum() + TINY))
+    return float((strips.coherence_at(distance)[:, 0] * share).sum() / (np.square(share).sum() + TINY))
 
 
 def _band_passed(light: Float32Array, short: int, n: int, margin: int = 0) -> tuple[Float32Array, Float32Array]:
@@ -297,20 +335,19 @@ def _short_rows(light: Float32Array) -> int:
     return int(np.clip(round(_SHORT_SHARE * half_lag), _MIN_SHORT_ROWS, max_rows))
 
 
-def _windows(band: Float32Array, n_windows: int) -> Float32Array:
-    """(W, S, R) windows of rows, each strip scaled to a mean square of one."""
-    changes = np.ascontiguousarray(band.reshape(len(band), n_windows, -1).swapaxes(0, 1))
-    changes /= (np.sqrt(_power(changes)) + np.float32(TINY))[..., None]
-    return changes
+def _without_row_noise(band: Float32Array) -> tuple[Float32Array, ...]:
+    """Scale strips (W, S, R) to a mean square of one, without the common part of the least coherent ones.
 
-
-def _without_row_noise(changes: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Remove the common part of the least coherent strips: changes, (W, S) coherence of neighbours, (W, R) noise."""
-    n_dark = max(int(_DARK_SHARE * changes.shape[1]), 1)
-    dark = np.argsort(_smooth(_neighbours(changes), 5, 1), axis=1)[:, :n_dark]
+    Returns:
+        changes, (W, S) coherence of neighbours, (W, S) power of stripes, (W, R) noise.
+    """
+    power = _power(band)
+    changes = band / (np.sqrt(power) + np.float32(TINY))[..., None]
+    together = _smooth(_neighbours(changes), 5, 1)
+    dark = np.argsort(together, axis=1)[:, : max(int(_DARK_SHARE * changes.shape[1]), 1)]
     noise = np.take_along_axis(changes, dark[..., None], axis=1).mean(axis=1)
     quiet = _without(changes, noise)
-    return quiet, _lit(quiet), noise
+    return quiet, _lit(quiet), np.where(together > 0.5, power * together, np.float32(0)), noise
 
 
 def _without(changes: Float32Array, part: Float32Array) -> Float32Array:

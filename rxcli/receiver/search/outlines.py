@@ -13,7 +13,7 @@ from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.plane import turned
 from rxcli.receiver.plane.orientation import PORTRAIT
 from rxcli.receiver.screen import find, geometry
-from rxcli.receiver.screen.bright import bright_quadrilateral, faint_quadrilaterals, striped_box
+from rxcli.receiver.screen.bright import bright_parts
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.stripes import MIN_LEAN, common_stripes, stripe_lean
 from rxcli.receiver.search.cameras import known_lens
@@ -51,7 +51,7 @@ def without_borders(cache: FrameCache) -> list[Outline]:
     if not may_fill(frame):
         return []
     with cache.timer("geometry"):
-        bright, striped = _bright(cache), cache.once("striped", lambda: striped_box(cache.plane))
+        bright, striped = _bright(cache), cache.once("striped", lambda: find.striped_box(cache.plane))
     if striped is None:
         return []
     own = Outline(
@@ -62,8 +62,12 @@ def without_borders(cache: FrameCache) -> list[Outline]:
 
 
 def _bright(cache: FrameCache) -> FloatArray | None:
-    """Corners of the bright part of a picture."""
-    return cache.once("bright", lambda: bright_quadrilateral(cache.plane))
+    """Corners of the brightest part of a picture."""
+    return _parts(cache)[0]
+
+
+def _parts(cache: FrameCache) -> list[FloatArray | None]:
+    return cache.once("parts", lambda: bright_parts(cache.plane))
 
 
 def _viewed(outline: Outline, frame: Frame) -> Outline:
@@ -91,7 +95,7 @@ def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
     with cache.timer("geometry"):
         bright = _bright(cache)
         key = ("screens", *layouts, key_of(lens))
-        parts = cache.once("parts", lambda: faint_quadrilaterals(cache.plane)) + ([] if bright is None else [bright])
+        parts = [part for part in _parts(cache) if part is not None]
         screens = cache.once(key, lambda: find.find_screens(cache.plane, layouts, lens, parts))
     wide = [layout.n_columns for layout in layouts if not layout.is_narrow]
 

@@ -12,7 +12,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.plane import read_plane
 from rxcli.receiver.receive import receive_frame
-from rxcli.receiver.screen.bright import bright_quadrilateral, faint_quadrilaterals
+from rxcli.receiver.screen.bright import bright_parts
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import outlines
 from rxcli.types import Frame
@@ -39,7 +39,7 @@ def picture_of(corners: np.ndarray, level: int = 200, dark: tuple[slice, slice] 
     ids=["whole", "hole", "corner", "large corner"],
 )
 def test_corners_of_a_bright_part(dark: tuple[slice, slice] | None) -> None:
-    found = bright_quadrilateral(read_plane(picture_of(CORNERS, dark=dark)))
+    found = bright_parts(read_plane(picture_of(CORNERS, dark=dark)))[0]
     assert found is not None
     np.testing.assert_allclose(found, CORNERS, atol=12)
 
@@ -54,7 +54,7 @@ def test_corners_of_a_bright_part(dark: tuple[slice, slice] | None) -> None:
     ids=["small", "triangle", "two sides in view"],
 )
 def test_what_is_no_screen(corners: np.ndarray) -> None:
-    assert bright_quadrilateral(read_plane(picture_of(corners))) is None
+    assert bright_parts(read_plane(picture_of(corners)))[0] is None
 
 
 @pytest.mark.parametrize("step", [6, 0])
@@ -62,7 +62,7 @@ def test_a_dark_screen_is_a_faint_part_around_a_bright_window(step: int) -> None
     frame, rng = picture_of(CORNERS, 20 + step), np.random.default_rng(5)
     frame.pixels[300:700, 500:1000] = 220
     noisy = (frame.pixels + rng.normal(0, 4, frame.pixels.shape)).clip(0, 255).astype(np.uint8)
-    found = faint_quadrilaterals(read_plane(replace(frame, pixels=noisy)))
+    found = [part for part in bright_parts(read_plane(replace(frame, pixels=noisy))) if part is not None]
     np.testing.assert_allclose(found[0], [[500, 300], [1000, 300], [1000, 700], [500, 700]], atol=20)
     near = [corners for corners in found if np.abs(corners - CORNERS).max() < 20]
     assert len(near) == bool(step)

@@ -408,6 +408,14 @@ def profile_of(picture: str) -> LightProfile:
     return light_profile(strips, predicted_light(strips, columns_at(grid.coefficients, strips.x, strips.y), 0.45), grid)
 
 
+def test_a_plane_seen_edge_on_has_no_end_of_columns() -> None:
+    strips, grid = read_strips(drawn("white")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
+    edge_on = replace(grid, coefficients=grid.coefficients + np.array([0, 0, 0, 2.0004, 0, 0]))
+    u = columns_at(edge_on.coefficients, strips.x, strips.y)
+    assert np.ptp(u) > 1000
+    assert light_profile(strips, predicted_light(strips, u, 0.45), edge_on).place.size < 5000
+
+
 def test_columns_with_light_are_told_from_those_without() -> None:
     light = profile_of("window")
     inside, outside = (light.place > 3) & (light.place < 14), (light.place < -0.2) | (light.place > 20.2)
