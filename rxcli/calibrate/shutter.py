@@ -33,14 +33,12 @@ _STRIPS, _PARTS = 32, 12
 #: Fewest lines along which stripes are sought.
 _MIN_SIDE = 24
 _MAX_LAMPS = 8
-#: Share of the picture from which a lamp's stripes leave the other axis no chance.
-_ENOUGH_AREA = 0.03
 #: Share of textures taken for a lamp, where textures lie within `_TEXTURE_LEAN` radians of the lines at any angle.
 _FALSE_ALARM, _TEXTURE_LEAN = 0.01, 0.1
 #: Windows that are fitted in search of a lamp; fewest periods of a lamp in a spot.
 _MAX_TRIED, _MIN_SPOT_PERIODS = 3, 2.5
 #: Stripes that are enough wherever they are.
-ENOUGH_PERIODS = 6
+_ENOUGH_PERIODS = 6
 #: Logarithm of the ratio of two line delays that may still be one.
 _SAME_LINE_DELAY = 0.02
 #: Readout from which it is doubted; periods of the blocks of codecs, and the relative distance at which one is equal.
@@ -149,7 +147,7 @@ def find_stripes(picture: Picture, axis: Axis | None = None, window: Box | None 
 
     Args:
         picture: (height, width) brightness, any scale.
-        axis: the readout axis; None: the one along which the stripes are clearer.
+        axis: the readout axis; None: the rows if they show a lamp, or that along which the stripes are clearer.
         window: part of the picture to search; None: all of it.
 
     Returns:
@@ -157,10 +155,8 @@ def find_stripes(picture: Picture, axis: Axis | None = None, window: Box | None 
     """
     left, top, right, bottom = window = window or (0, 0, picture.shape[1], picture.shape[0])
     by_axis: dict[Axis, list[Stripes]] = {}
-    in_spots: dict[Axis, int] = {}
     for along in (axis,) if axis else ("rows", "columns"):
         found = by_axis[along] = _find_in(picture, window, along)
-        n_whole = len(found)
         for x0, y0, x1, y1 in find_spots(picture[top:bottom, left:right], 0 if along == "rows" else 1):
             spot = (x0 + left, y0 + top, x1 + left, y1 + top)
             if any(2 * _common_area(spot, lamp.bounds) >= _common_area(spot, spot) for lamp in found):
@@ -169,11 +165,9 @@ def find_stripes(picture: Picture, axis: Axis | None = None, window: Box | None 
                 overlap = (5 * _common_area(lamp.bounds, s.bounds) >= min(lamp.area_px, s.area_px) for s in found)
                 if lamp.fit.periods >= _MIN_SPOT_PERIODS and not any(overlap):
                     found.append(lamp)
-        in_spots[along] = len(found) - n_whole
-        if sum(lamp.area_px for lamp in found if lamp.is_lamp) > _ENOUGH_AREA * picture.size:
-            break
-    # Lamps in a line look like one lamp that blinks along it; stripes in two or more of them show that they are not.
-    return max(by_axis.items(), key=lambda item: (in_spots[item[0]] >= 2, _evidence(item[1])))
+        if any(lamp.is_lamp for lamp in found):
+            return along, found
+    return max(by_axis.items(), key=lambda item: _evidence(item[1]))
 
 
 def _common_area(box_a: Box, box_b: Box) -> int:
@@ -341,13 +335,7 @@ def calibrate_shutter(
     regions = [replace(s, picture=i) for i, (of, found) in enumerate(by_picture) if of == along for s in found]
     if not regions:
         where = "the picture" if len(pictures) == 1 else f"any of {len(pictures)} pictures"
-        bands = max(bands_across(picture, along) for picture in pictures for along in ((axis,) if axis else axes))
-        if bands:
-            hz = max(frequencies_hz) * ENOUGH_PERIODS / bands
-            reason = f"too few stripes in {where}: {bands} bright band{'s' * (bands > 1)} across it at most"
-            raise ReceiverError(reason, f"let the lamp blink at {hz:.2g} Hz or more, or use a slower readout")
-        hint = "let the lamp fill more of the frame, expose for well below half a period, by the electronic shutter"
-        raise ReceiverError(f"no stripes of a blinking lamp in {where}", f"{hint}, without HDR and flicker reduction")
+        raise not_found(where, pictures, (axis,) if axis else axes, max(frequencies_hz))
     reference = _common_line_delay(regions, frequencies_hz)
     lamps = [replace(s, frequency_hz=_match(s, frequencies_hz, reference)) for s in regions]
     used = [(lamp, lamp.frequency_hz) for lamp in lamps if lamp.frequency_hz]
@@ -372,6 +360,23 @@ def _doubts(result: ShutterCalibration, *, is_coded: bool) -> tuple[str, ...]:
     return tuple(doubts)
 
 
+def not_found(
+    where: str, pictures: Sequence[Picture], axes: Sequence[Axis] = ("rows", "columns"), hz: float | None = None
+) -> ReceiverError:
+    """Why there are no stripes in pictures of a lamp, of known frequency or not."""
+    bands = max(bands_across(picture, axis) for picture in pictures for axis in axes)
+    if bands:
+        faster = (
+            f"{_ENOUGH_PERIODS / bands:.2g} times its frequency"
+            if hz is None
+            else f"{hz * _ENOUGH_PERIODS / bands:.2g} Hz"
+        )
+        reason = f"too few stripes in {where}: {bands} bright band{'s' * (bands > 1)} across it at most"
+        return ReceiverError(reason, f"let the lamp blink at {faster} or more, or use a slower readout")
+    hint = "let the lamp fill more of the frame, expose for well below half a period, by the electronic shutter"
+    return ReceiverError(f"no stripes of a blinking lamp in {where}", f"{hint}, without HDR and flicker reduction")
+
+
 def bands_across(picture: Picture, axis: Axis) -> int:
     """Bright bands across the whole picture, as a lamp that is too slow makes them; 0 where there are none, or many."""
     upright = picture if axis == "rows" else picture.T
@@ -383,7 +388,7 @@ def bands_across(picture: Picture, axis: Axis) -> int:
         return 0
     bright = common > (common.max() + common.min()) / 2
     bands = int(np.sum(np.diff(bright.astype(int), prepend=0) > 0))
-    return bands if bands < ENOUGH_PERIODS else 0
+    return bands if bands < _ENOUGH_PERIODS else 0
 
 
 def _common_line_delay(regions: list[Stripes], frequencies_hz: Sequence[float]) -> float:

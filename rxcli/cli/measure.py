@@ -9,7 +9,7 @@ import click
 
 from rxcli.calibrate.frames import frame_light
 from rxcli.calibrate.measure import Lamp, Timing, draw_lamps, measure_lamp
-from rxcli.calibrate.shutter import ENOUGH_PERIODS, Picture, Stripes, bands_across, find_stripes
+from rxcli.calibrate.shutter import Stripes, find_stripes, not_found
 from rxcli.cli.common import force_argument, json_output, options, output, refuse, write_json
 from rxcli.cli.kinds import CAMERA, FILE, Exposure
 from rxcli.errors import InputError, ReceiverError
@@ -68,7 +68,9 @@ def measure(path: Path, frame: int, axis: str, picture: Path | None, force: bool
     lamps = [measure_lamp(stripes, timing, exposure_s, linear) for stripes in found if stripes.is_lamp]
     doubtful = [stripes for stripes in found if not stripes.is_lamp]
     if not lamps:
-        raise _not_found(path, light, doubtful)
+        if doubtful:
+            raise ReceiverError(f"no stripes surely of a blinking lamp in {path}", _doubt(doubtful))
+        raise not_found(str(path), [light])
     notes = _notes(frames, lamps, timing, n_rows) + ([_doubt(doubtful)] if doubtful else [])
     for sentence in dict.fromkeys([*notes, *(text for lamp in lamps for text in lamp.notes)]):
         click.echo(f"vlc-rx: {sentence}", err=True)
@@ -89,19 +91,6 @@ def _doubt(doubtful: list[Stripes]) -> str:
     where = f"of {largest.period_px:.4g} px at {largest.bounds[0]},{largest.bounds[1]}"
     count = f"{len(doubtful)} region{'s' * (len(doubtful) > 1)} of stripes ({where})"
     return f"{count} may be texture, no lamp; in a second picture, exposed otherwise, a lamp's stripes are elsewhere"
-
-
-def _not_found(path: Path, light: Picture, doubtful: list[Stripes]) -> ReceiverError:
-    """Why nothing is measured."""
-    bands = max(bands_across(light, way) for way in ("rows", "columns"))
-    step = "let the lamp fill more of the picture, expose for well below half a period, by the electronic shutter"
-    if bands:
-        reason = f"{path}: {bands} bright band{'s' * (bands > 1)} across the picture: too few stripes to measure"
-        return ReceiverError(
-            reason, f"a lamp {ENOUGH_PERIODS / bands:.2g} times as fast, or a slower readout, would do"
-        )
-    reason = "no stripes that are surely of a blinking light" if doubtful else "no stripes of a blinking light"
-    return ReceiverError(f"{path}: {reason}", _doubt(doubtful) if doubtful else step)
 
 
 def _timing(frame: Frame, n_rows: int, given: dict[str, Any]) -> Timing | None:

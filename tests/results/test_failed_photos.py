@@ -24,7 +24,8 @@ PHOTOS = {
         "raise ISO, or show a brighter picture",
     ),
     "portrait": (
-        "the same stripes run across all columns, as of a screen on its side in the picture (portrait)",
+        "the same stripes run across all columns, as of a lamp that blinks, or of a screen on its side in the "
+        "picture (portrait)",
         "turn the camera, until its long side lies along the screen's",
     ),
     "ordinary": ("no screen that sends was found", "photograph it from near"),
