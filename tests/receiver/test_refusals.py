@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_pipeline import corners_of, frame_of, options_for, proportioned
+from test_pipeline import proportioned
 
 from rxcli.lab.simulate.capture import prepare
 from rxcli.lab.simulate.pictures import load_picture
@@ -27,7 +27,7 @@ def photo(name: str) -> NDArray[np.uint8]:
 
 
 def test_stripes_lean_across_or_downwards_and_photographs_hardly() -> None:
-    stripes = proportioned().pixels
+    stripes = proportioned().frame.pixels
     assert stripe_lean(stripes) > MIN_LEAN
     assert stripe_lean(np.rot90(stripes)) == pytest.approx(-stripe_lean(stripes), abs=0.01)
     assert max(stripe_lean(photo(name)) for name in ("astronaut", "coffee", "rocket", "retina")) < MIN_LEAN
@@ -125,16 +125,16 @@ def test_a_photo_that_states_an_exposure_of_many_slots_is_searched_on_request_or
         Frame(photo("coffee"), "photo", metadata=stated), replace(options, skip=options.skip - {"no_screen"})
     )
     assert "not_searched" not in [remark.reason for remark in insisted.remarks]
-    striped = receive_frame(replace(frame_of(proportioned()), metadata=stated), options)
+    striped = receive_frame(replace(proportioned().frame, metadata=stated), options)
     assert "not_searched" not in [remark.reason for remark in striped.remarks]
 
 
 def test_columns_out_of_the_picture_are_not_told_to_come_closer() -> None:
     taken = proportioned()
-    corners = corners_of(taken)
+    corners = taken.options().corners
     width = round(0.6 * corners[:, 0].max())
-    options = options_for(taken)
-    cut = replace(frame_of(taken), pixels=np.ascontiguousarray(taken.pixels[:, :width]))
+    options = taken.options()
+    cut = replace(taken.frame, pixels=np.ascontiguousarray(taken.frame.pixels[:, :width]))
     result = receive_frame(cut, replace(options, cameras=(), force_camera=False))
     hidden = [column.column for column in result.columns if column.reason == "out_of_view"]
     assert hidden == list(range(hidden[0], 20))
