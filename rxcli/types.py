@@ -331,7 +331,8 @@ class BurstPosteriors:
     w: NDArray[np.int64]
     #: (C, 9) float64: log evidence of w = 1..9, normalised to a sum of 1 in probability.
     w_log_prob: FloatArray
-    #: (C,) float64: log evidence of packets in the column, summed over the candidate weights.
+    #: (C,) float64: log evidence of packets in the column, summed over the weights; of a frame, against slots of any
+    #: kind.
     log_evidence: FloatArray
     #: (B, C, 20 + 10 N) float32: probability that the slot is lit.
     lit: Float32Array

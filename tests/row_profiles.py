@@ -104,17 +104,5 @@ def picture(shape: tuple[int, int, int], shot: Shot, rng: np.random.Generator) -
     return np.exp(np.reshape(flat, shape))
 
 
-def slot_odds(metrics: FloatArray, memory: int) -> FloatArray:
-    """(C, N) log-odds of every slot from metrics (C, N + memory, patterns), each metric on its own: sum over those
-    that the slot has a part in, all other slots being as likely lit as dark."""
-    n = metrics.shape[1] - memory
-    total = np.zeros((metrics.shape[0], n))
-    for back in range(memory + 1):
-        lit = (np.arange(2 << memory) >> back) & 1 == 1
-        one, zero = (np.logaddexp.reduce(metrics[..., part], axis=2) for part in (lit, ~lit))
-        total += (one - zero)[:, back : back + n]
-    return total
-
-
 def sigma_of(profiles: RowProfiles) -> float:
     return float(np.sqrt(profiles.noise_floor))

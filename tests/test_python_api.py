@@ -16,7 +16,6 @@ import rxcli
 from rxcli.errors import ReceiverError
 from rxcli.options import SKIPS
 from rxcli.profiles import shipped_profiles, usual_screens
-from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput
 from rxcli.receiver.decode.detect import detect
 from rxcli.resources import data_dir
@@ -113,7 +112,7 @@ def test_a_photo_gives_its_packets_from_a_path_or_a_frame(tapped: tuple[rxcli.Fr
     assert len(packet.payload_bytes) == -(-packet.payload_bits // 8)
     frame = next(iter(rxcli.open_source(PHOTO)))
     assert payloads(KNOWN.decode(frame)) == payloads(next(KNOWN.receive([frame]))) == payloads(result)
-    detected = detect(by_burst(taps.metrics, taps.clock))  # taps feed the detector
+    detected = detect(taps.clock.by_burst(taps.llr))  # taps feed the detector
     # But for columns whose slots and picture were detected jointly.
     assert (detected.index == taps.posteriors.index).mean() > 0.9
 

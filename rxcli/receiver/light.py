@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import MIN_FLOAT32, NORMAL_MEDIAN, TINY, local_mean
-from rxcli.protocol import HEADER, slot_patterns
+from rxcli.numerics import NORMAL_MEDIAN, TINY, local_mean
+from rxcli.protocol import HEADER
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Points over which the mean of a sample or a strip is taken.
@@ -329,38 +329,3 @@ def take_places(values: NDArray[Any], index: IntArray) -> NDArray[Any]:
     if index.shape[0] == 1:
         return np.asarray(values.take(index[0], axis=1))
     return np.asarray(values.ravel().take(index + (np.arange(values.shape[0]) * values.shape[1])[:, None]))
-
-
-def slot_llr(metrics: FloatArray, lit: Float32Array | None = None) -> Float32Array:
-    """Log-likelihood ratio of each slot being lit, from the log-likelihoods of slot patterns.
-
-    A slot contributes to its own metric and to the `isi_memory` metrics after it; their ratios are added.
-
-    Args:
-        metrics: (..., N + memory, patterns) log-likelihood of every pattern of slots n - memory .. n.
-        lit: (..., N) probability that each slot is lit, neither 0 nor 1, as far as it concerns its neighbours; None:
-            lit and dark are equally likely.
-
-    Returns:
-        (..., N) float32.
-    """
-    isi_memory = int(metrics.shape[-1]).bit_length() - 2
-    n_slots = metrics.shape[-2] - isi_memory
-    by_age = _lit_by_age(isi_memory)
-    log_odds = np.zeros(1, np.float32)
-    if lit is not None:
-        beyond = [(0, 0)] * (lit.ndim - 1) + [(isi_memory, isi_memory)]
-        prior_llr = np.pad(np.log(lit) - np.log1p(-lit), beyond)
-        log_odds = np.lib.stride_tricks.sliding_window_view(prior_llr, isi_memory + 1, axis=-1)[..., ::-1]
-        metrics = metrics + log_odds @ by_age.T
-    # Much faster than the maximum over the last axis, which is short.
-    top = np.ascontiguousarray(np.moveaxis(metrics, -1, 0)).max(axis=0)
-    likelihood = np.exp((metrics - top[..., None]).astype(np.float32))
-    gained = np.log(likelihood @ by_age + MIN_FLOAT32) - np.log(likelihood @ (1 - by_age) + MIN_FLOAT32) - log_odds
-    return np.asarray(sum(gained[..., age : age + n_slots, age] for age in range(isi_memory + 1)), np.float32)
-
-
-@cache
-def _lit_by_age(isi_memory: int) -> Float32Array:
-    """(patterns, memory + 1): 1 where the slot `age` slots ago is lit."""
-    return np.ascontiguousarray(slot_patterns(isi_memory)[:, ::-1], np.float32)

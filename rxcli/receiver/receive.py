@@ -131,7 +131,7 @@ def _receive_screen(
         return Received(replace(nothing, search=tuple(tried.step for tried in found.tried)), {})
     outline, context, acquisition = found.outline, found.best.context, found.best.acquisition
     camera = context.camera
-    # Channel and decode, in turn: metrics of slots to symbols, and symbols to the picture.
+    # Channel and decode, in turn: slots to symbols, and symbols to the picture.
     with timer("detect"):
         reception = decode_photograph(acquisition, options.skip, found.best.reception)
         no_header, framing = headerless(reception), framing_of(acquisition, reception, found.screens, context)
@@ -219,7 +219,7 @@ def _taps(found: Found, reception: Reception) -> dict[str, Any]:
         "sampling": found.best.acquisition.profiles,
         "clock": reception.clock,
         "samples": initial.samples,
-        "channel.initial_metrics": initial.metrics,
-        "channel.metrics": reception.metrics,
+        "channel.initial_llr": initial.llr,
+        "channel.llr": reception.llr,
         "detect": reception.posteriors,
     }

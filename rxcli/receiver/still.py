@@ -27,14 +27,19 @@ from rxcli.receiver.light import (
     Exposure,
     NoiseModel,
     dark_sigma,
-    slot_llr,
 )
 from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.sync.settings import SETTINGS as sync_settings
-from rxcli.types import BurstPosteriors, BurstSamples, Clock, Denoiser, Float32Array, FloatArray, SlotSamples
-
-#: Least distance of a slot's probability from 0 and 1.
-_MIN_DOUBT = 1e-4
+from rxcli.types import (
+    BoolArray,
+    BurstPosteriors,
+    BurstSamples,
+    Clock,
+    Denoiser,
+    Float32Array,
+    FloatArray,
+    SlotSamples,
+)
 
 
 def decode_photograph(acquisition: Acquisition, skip: frozenset[str], initial: Reception) -> Reception:
@@ -54,7 +59,7 @@ def _may_show_packets(initial: Reception) -> bool:
     """Whether the initial pass may contain a packet."""
     if (initial.packet_confidence[initial.is_complete] > STILL.doubtful).any():
         return True
-    return packet_llr(initial) + max(float(initial.posteriors.header_llr.sum()), 0.0) > SETTINGS.min_packets_llr
+    return packet_llr(initial) + max(float(initial.header_llr.sum()), 0.0) > SETTINGS.min_packets_llr
 
 
 def decode(
@@ -71,7 +76,7 @@ def decode(
         acquisition: the clock and the row profiles.
         skip: enabled shortcuts, see `rxcli.options.SKIPS`.
         initial: the initial pass.
-        adds_up: whether the metrics are to be added to those of other frames.
+        adds_up: whether the slots are to be added to those of other frames.
         keeps_weights: whether the weights of the initial pass are known.
     """
     reception = initial = _with_tails(acquisition, initial)
@@ -81,7 +86,7 @@ def decode(
     candidates = doubtful_columns(initial) if "certain_columns" in skip and is_short else np.arange(n_columns)
     lit = candidates[~dark_columns(initial.snr)[candidates]] if "dark_columns" in skip else candidates
     skipped = {"certain_columns": n_columns - candidates.size, "dark_columns": candidates.size - lit.size}
-    # Joint detection gives no metrics, and developing mixes rows that are few per slot.
+    # Joint detection gives no slots by themselves, and developing mixes rows that are few per slot.
     by_slot = adds_up or initial.clock.rows_per_slot < STILL.min_joint_rows
     if lit.size and by_slot and not initial.is_long:
         reception, _ = without_row_noise(acquisition, reception, lit)
@@ -105,7 +110,7 @@ def _with_tails(acquisition: Acquisition, initial: Reception) -> Reception:
         return initial
     model = initial.model.with_tails(light_spread, tails)
     found = channel.slot_likelihoods(initial.samples, initial.clock, model, lit, columns, is_initial=True)
-    return replace(_with_metrics(initial, columns, found.metrics, found.snr), model=model)
+    return replace(_with_llr(initial, columns, found.llr, found.snr), model=model)
 
 
 def initial_pass(acquisition: Acquisition, room_light: float = 1.0) -> Reception:
@@ -125,21 +130,21 @@ def initial_pass(acquisition: Acquisition, room_light: float = 1.0) -> Reception
     samples = sync.sample_slots(acquisition.profiles, clock, STILL.coarse_samples)
     model = _light_model(acquisition, clock, samples, room_light)
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
-    metrics = channel.initial_metrics(*contrast, model.exposure)
-    clock = in_bursts(acquisition, clock, metrics)
-    lit = clock.on_grid(detected(metrics, clock, weight_margin=0.0).lit)
+    llr = channel.initial_llr(*contrast, model.exposure)
+    clock = in_bursts(acquisition, clock, llr)
+    lit = clock.on_grid(detected(llr, clock).lit)
     columns = np.arange(samples.light.shape[0])
     likelihoods = channel.slot_likelihoods(samples, clock, model, lit, columns, is_initial=True)
-    clock = in_bursts(acquisition, clock, likelihoods.metrics)
+    clock = in_bursts(acquisition, clock, likelihoods.llr)
     clock = sync.corrected(clock, likelihoods.timing)
-    posteriors = detected(likelihoods.metrics, clock)
+    posteriors = detected(likelihoods.llr, clock)
     joint = np.zeros(columns.size, bool)
-    return Reception(clock, samples, contrast, posteriors, likelihoods.snr, model, likelihoods.metrics, joint)
+    return Reception(clock, samples, contrast, posteriors, likelihoods.snr, model, likelihoods.llr, joint)
 
 
 def detected_on(reception: Reception, clock: Clock) -> Reception:
     """The initial pass with its slots at other places in their packets."""
-    return replace(reception, clock=clock, posteriors=detected(reception.metrics, clock))
+    return replace(reception, clock=clock, posteriors=detected(reception.llr, clock))
 
 
 def slots_of_any_kind(acquisition: Acquisition, clocks: Sequence[Clock]) -> list[tuple[Float32Array, float]]:
@@ -177,13 +182,13 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     single = clock.by_copy
     alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
     lit = single.on_grid(alone.lit)
-    metrics = channel.metrics_of(llr_of(lit), 1)
+    llr = channel.llr_of(lit)
     some = _some(columns)
 
     def of_way(clock: Clock) -> BurstSamples:
         return _of_weights(ratios.burst_samples(by_start, clock, model, some, lit), alone.w_log_prob[some])
 
-    clock, _ = _ways_by_evidence(acquisition, clock, metrics, of_way)[0]
+    clock, _ = _ways_by_evidence(acquisition, clock, llr, of_way)[0]
     bursts = _with_weights(of_bursts(clock, lit), alone.w_log_prob)
     posteriors, free = survivors.detect_against_free(bursts, QUICK_SURVIVORS)
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
@@ -193,12 +198,9 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     is_shown = observed.reshape(*posteriors.log_prob.shape, -1).all(axis=-1)
     is_decided = (posteriors.log_prob > np.log(0.5)) & is_shown
     share = is_decided.sum(axis=(0, 2)) / np.maximum(is_shown.sum(axis=(0, 2)), 1) * ~dark_columns(snr)
-    llr = (posteriors.log_evidence - free) * share
-    shape = posteriors.header_llr.shape
-    posteriors = replace(posteriors, header_llr=np.broadcast_to(llr / shape[0], shape))
-    free = posteriors.log_evidence - llr
+    posteriors = replace(posteriors, log_evidence=(posteriors.log_evidence - free) * share)
     joint = np.ones(len(columns), bool)
-    return Reception(clock, samples, contrast, posteriors, snr, model, metrics, joint, free)
+    return Reception(clock, samples, contrast, posteriors, snr, model, llr, joint, is_long=True)
 
 
 def detect_jointly(
@@ -275,12 +277,6 @@ def _joint_snr(
     return np.asarray(ratio[..., q // 2 :: q].sum(axis=1) * np.float32(survivor_settings.information))
 
 
-def llr_of(lit: Float32Array) -> Float32Array:
-    """Log-likelihood ratios of slots from their probabilities."""
-    bounded = np.clip(lit, _MIN_DOUBT, 1 - _MIN_DOUBT)
-    return np.asarray(np.log(bounded) - np.log1p(-bounded), np.float32)
-
-
 def follow_picture(
     acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64], *, keeps_weights: bool = False
 ) -> Reception:
@@ -298,9 +294,9 @@ def follow_picture(
     # Of long exposures columns are too rarely right to show what they have in common.
     found = survivors.detect(bursts, has_common_weights=not reception.is_long)
     header_llr, log_prob = reception.posteriors.header_llr[:, columns], found.log_prob
-    if reception.is_long:  # Where arbitrary slots explain a column as well, it may have no packets.
-        log_prob = log_prob - np.logaddexp(0, -header_llr.sum(axis=0))[None, :, None] / log_prob.shape[2]
     log_evidence = reception.posteriors.log_evidence[columns]
+    if reception.is_long:  # Where arbitrary slots explain a column as well, it may have no packets.
+        log_prob = log_prob - np.logaddexp(0, -log_evidence)[None, :, None] / log_prob.shape[2]
     found = replace(found, header_llr=header_llr, log_evidence=log_evidence, log_prob=log_prob)
     joint = reception.joint.copy()
     joint[columns] = True
@@ -336,24 +332,22 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
     light = reception.samples.light[reception.samples.valid > 0]
     levels = [float(np.percentile(light, STILL.dark_percent)) * share for share in STILL.dark_shares]
     level = levels[likeliest([bursts(clock, level) for level in levels])]
-    ways = _ways_by_evidence(acquisition, clock, reception.metrics, lambda way: bursts(way, level))
+    ways = _ways_by_evidence(acquisition, clock, reception.llr, lambda way: bursts(way, level))
     (best, _), by_evidence = ways[0], [(way.burst, gain) for way, gain in ways]
     refined = replace(
         reception, clock=best, model=replace(reception.model, black_level=level), bursts_by_evidence=by_evidence
     )
     if np.array_equal(best.burst, reception.clock.burst):
         return refined
-    posteriors = detected(reception.metrics, best)
-    header_llr = np.repeat(reception.posteriors.header_llr[:1], len(posteriors.header_llr), axis=0)
-    log_evidence = reception.posteriors.log_evidence
-    return replace(refined, posteriors=replace(posteriors, header_llr=header_llr, log_evidence=log_evidence))
+    posteriors = replace(detected(reception.llr, best), log_evidence=reception.posteriors.log_evidence)
+    return replace(refined, posteriors=posteriors)
 
 
 def _ways_by_evidence(
-    acquisition: Acquisition, clock: Clock, metrics: FloatArray, bursts: Callable[[Clock], BurstSamples]
+    acquisition: Acquisition, clock: Clock, llr: Float32Array, bursts: Callable[[Clock], BurstSamples]
 ) -> list[tuple[Clock, float]]:
     """Assignments of copies to bursts, likeliest first, each with its lead in the log evidence of some columns."""
-    ways = [way for way, _ in sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)]
+    ways = [way for way, _ in sync.possible_bursts(clock, llr, acquisition.repeats)]
     if len(ways) == 1:
         return [(ways[0], 0.0)]
     by_column, most = survivors.log_evidence_of([bursts(way) for way in ways], GLANCE), STILL.max_column_gain
@@ -380,18 +374,16 @@ def in_other_bursts(acquisition: Acquisition, reception: Reception) -> Iterator[
     """
     if reception.is_long:
         return
-    (_, log_weight), *rivals = sync.possible_bursts(reception.clock, slot_llr(reception.metrics), acquisition.repeats)
+    (_, log_weight), *rivals = sync.possible_bursts(reception.clock, reception.llr, acquisition.repeats)
     for clock, rival_log_weight in rivals:
         if log_weight - rival_log_weight <= sync_settings.settled_llr or not reception.is_complete.any():
-            rival = replace(reception, clock=clock, posteriors=detected(reception.metrics, clock))
-            yield rival, log_weight - rival_log_weight
+            yield detected_on(reception, clock), log_weight - rival_log_weight
 
 
 def as_one_column(reception: Reception) -> Reception:
     """Receive all columns as one that sends the same."""
     middle = reception.of_columns(np.array([reception.snr.shape[0] // 2]))
-    metrics = reception.metrics.sum(axis=0, keepdims=True)
-    return replace(middle, metrics=metrics, posteriors=detected(metrics, middle.clock))
+    return detected_on(replace(middle, llr=reception.llr.sum(axis=0, keepdims=True)), middle.clock)
 
 
 def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
@@ -403,26 +395,24 @@ def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
 def without_row_noise(
     acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]
 ) -> tuple[Reception, denoise.DenoiserInput]:
-    """Metrics of some columns on the fine grid after removal of row noise; and the input of the auto-encoder."""
+    """Slots of some columns on the fine grid after removal of row noise; and the input of the auto-encoder."""
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), denoise.SAMPLES_PER_SLOT)
     lit = reception.clock.on_grid(reception.posteriors.lit)
     whole = model.expected(lit, reception.clock, np.arange(len(lit))).whole
     samples = denoise.remove_row_noise(samples, whole, model)
     likelihoods = channel.slot_likelihoods(samples.of_columns(columns), reception.clock, model, lit, columns)
-    by_slot = _with_metrics(reception, columns, likelihoods.metrics, likelihoods.snr)
+    by_slot = _with_llr(reception, columns, likelihoods.llr, likelihoods.snr)
     return by_slot, by_slot.scene_of(samples, model)
 
 
-def _with_metrics(
-    reception: Reception, columns: NDArray[np.int64], metrics: FloatArray, snr: Float32Array
-) -> Reception:
-    """Replace the metrics of some columns and detect their words again."""
-    of_all, snr_of_all = reception.metrics.copy(), reception.snr.copy()
-    of_all[columns], snr_of_all[columns] = metrics, snr
-    posteriors = reception.posteriors.with_columns(columns, detected(metrics, reception.clock))
+def _with_llr(reception: Reception, columns: NDArray[np.int64], llr: Float32Array, snr: Float32Array) -> Reception:
+    """Replace the slots of some columns and detect their words again."""
+    of_all, snr_of_all = reception.llr.copy(), reception.snr.copy()
+    of_all[columns], snr_of_all[columns] = llr, snr
+    posteriors = reception.posteriors.with_columns(columns, detected(llr, reception.clock))
     joint = reception.joint.copy()
     joint[columns] = False
-    return replace(reception, metrics=of_all, snr=snr_of_all, posteriors=posteriors, joint=joint)
+    return replace(reception, llr=of_all, snr=snr_of_all, posteriors=posteriors, joint=joint)
 
 
 def _view(
@@ -468,8 +458,7 @@ def apply_autoencoder(
         corrections = denoiser.slot_corrections(scene, columns)
     except ReceiverError as error:
         return reception, frozenset(), {**report, "columns": 0, "message": str(error)}
-    corrected = by_slot.metrics[columns] + channel.metrics_of(corrections, reception.model.exposure.isi_memory)
-    after = _with_metrics(by_slot, columns, corrected, by_slot.snr[columns])
+    after = _with_llr(by_slot, columns, by_slot.llr[columns] + corrections, by_slot.snr[columns])
     surest = after.best_confidence(frozenset(columns.tolist()))
     is_surer = surest > np.maximum(reception.best_confidence(), STILL.min_corrected_confidence)
     improved = columns[is_surer[columns]]
@@ -479,9 +468,9 @@ def apply_autoencoder(
     posteriors = reception.posteriors.with_columns(improved, after.posteriors.of_columns(improved))
     # The network knows the positions of headers, so their presence is judged without it.
     posteriors = replace(posteriors, header_llr=reception.posteriors.header_llr)
-    metrics = np.where(is_improved[:, None, None], after.metrics, reception.metrics)
+    llr = np.where(is_improved[:, None], after.llr, reception.llr)
     joint = reception.joint & ~is_improved
-    return replace(reception, metrics=metrics, posteriors=posteriors, joint=joint), frozenset(improved.tolist()), report
+    return replace(reception, llr=llr, posteriors=posteriors, joint=joint), frozenset(improved.tolist()), report
 
 
 def _worth_showing(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -496,15 +485,16 @@ def _denoiser() -> Denoiser:
     return denoise.load_denoiser()
 
 
-def in_bursts(acquisition: Acquisition, clock: Clock, metrics: FloatArray) -> Clock:
-    """Assign copies to bursts by their similarity, from metrics (C, N + memory, patterns)."""
-    return sync.possible_bursts(clock, slot_llr(metrics), acquisition.repeats)[0][0]
+def in_bursts(acquisition: Acquisition, clock: Clock, llr: Float32Array) -> Clock:
+    """Assign copies to bursts by the similarity of their slots, from log-likelihood ratios (C, N)."""
+    return sync.possible_bursts(clock, llr, acquisition.repeats)[0][0]
 
 
-def detected(metrics: FloatArray, clock: Clock, weight_margin: float = SETTINGS.weight_margin) -> BurstPosteriors:
-    """Detect the packets of a clock from metrics (C, N + memory, patterns) of the grid."""
-    bursts = channel.by_burst(metrics, clock)
-    return detect.detect(bursts, detect.plausible_weights(bursts, weight_margin))
+def detected(llr: Float32Array, clock: Clock, weights: BoolArray | None = None) -> BurstPosteriors:
+    """Detect the packets of a clock from log-likelihood ratios (C, N) of the grid; see `detect.detect`."""
+    found = detect.detect(clock.by_burst(llr), weights)
+    free = detect.free_log_evidence(llr, found.w / SLOTS_PER_SYMBOL) + np.log(len(WEIGHTS))
+    return replace(found, log_evidence=found.log_evidence - free)
 
 
 def _light_model(

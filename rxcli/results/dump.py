@@ -11,7 +11,7 @@ import numpy as np
 
 from rxcli.errors import failure_explained
 from rxcli.outputs import TAPS, tapped
-from rxcli.types import BurstPosteriors, Clock, FloatArray, OnTaps, RowProfiles, SlotSamples
+from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, OnTaps, RowProfiles, SlotSamples
 
 _Stage = TypeVar("_Stage", RowProfiles, Clock, SlotSamples, BurstPosteriors)
 
@@ -32,10 +32,10 @@ class Taps:
     #: Out of sync: the link's time, and the light resampled to it in the initial pass.
     clock: Clock
     samples: SlotSamples
-    #: (C, N + memory, 2**(memory+1)) float64, out of the channel: log-likelihood of the light of slot i, given pattern
-    #: j of the slot and those before it (`protocol.slot_patterns`); of `samples`, and of the last pass of each column.
-    initial_metrics: FloatArray
-    metrics: FloatArray
+    #: (C, N) float32, out of the channel: log-likelihood ratio of each slot being lit; of `samples`, and of the last
+    #: pass of each column.
+    initial_llr: Float32Array
+    llr: Float32Array
     #: Out of detection.
     posteriors: BurstPosteriors
 
@@ -55,8 +55,8 @@ def read_taps(path: str | Path) -> Taps:
             _stage(arrays, "sampling", RowProfiles),
             _stage(arrays, "clock", Clock),
             _stage(arrays, "samples", SlotSamples),
-            arrays["channel.initial_metrics"],
-            arrays["channel.metrics"],
+            arrays["channel.initial_llr"],
+            arrays["channel.llr"],
             _stage(arrays, "detect", BurstPosteriors),
         )
 
@@ -76,7 +76,7 @@ def taps_writer(folder: Path | None) -> OnTaps | None:
 def dump_stages(folder: Path, source: str, frame: int, stages: Mapping[str, Any]) -> Path:
     """Write arrays, and dataclasses of arrays, to `folder`/SOURCE-FRAME.npz.
 
-    In frames' dumps stages and fields are those of `rxcli.types`; `geometry.corners` and `channel.metrics` stand beside
+    In frames' dumps stages and fields are those of `rxcli.types`; `geometry.corners` and `channel.llr` stand beside
     them. Bit log-likelihood ratios are ln p(1)/p(0).
 
     Args:

@@ -132,7 +132,7 @@ def _lit(taps: Mapping[str, Any], clock: Clock) -> FloatArray:
     if "detect" in taps:
         return np.asarray(clock.on_grid(taps["detect"].lit) > 0.5, np.float64)
     ended = {number: taps.get(f"detect.{number}") for number in taps["bursts.number"].tolist()}
-    unknown = np.full((len(taps["channel.metrics"]), clock.packet_slots), np.nan, np.float32)
+    unknown = np.full((len(taps["channel.llr"]), clock.packet_slots), np.nan, np.float32)
     bursts = [unknown if posteriors is None else np.round(posteriors.lit[0]) for posteriors in ended.values()]
     return np.asarray(clock.on_grid(np.stack(bursts)), np.float64)
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any, cast
+from typing import Any
 
 import cv2
 import msgspec
@@ -27,7 +27,7 @@ from rxcli.receiver.decode import detect
 from rxcli.receiver.frame import cache
 from rxcli.receiver.receive import receive
 from rxcli.results.record import to_record
-from rxcli.types import FloatArray, Frame, FrameResult
+from rxcli.types import Frame, FrameResult
 
 Change = Callable[[NDArray[Any]], NDArray[Any]]
 #: Ties: float32 may decide otherwise where the best two log-probabilities are this close.
@@ -152,22 +152,19 @@ def test_damaged_row_profiles(value: float, share: float, monkeypatch: pytest.Mo
     received(base_trial().frame, base_trial().options())
 
 
-def metrics_of(seed: int = 0) -> NDArray[np.float64]:
-    """(1, 4, slots, patterns) log-likelihoods of four packets of weights 3..6 in noise, memory of one slot."""
+def llr_of(seed: int = 0) -> NDArray[np.float64]:
+    """(1, 4, slots) log-likelihood ratios of four packets of weights 3..6 in noise."""
     rng = np.random.default_rng(seed)
     packets = [encode_packet(rng.integers(0, 2, payload_bits(w, 5)).astype(np.uint8), w) for w in range(3, 7)]
-    slots = np.concatenate([np.array(packets), np.array(packets)[:, :1]], axis=1)
-    before = np.concatenate([slots[:, :1], slots[:, :-1]], axis=1)
-    index = 2 * before + slots
-    clean = -1.5 * np.abs(index[..., None] - np.arange(4))
-    return np.asarray(clean + rng.normal(0, 1.2, clean.shape))[None]
+    clean = 3.0 * (2.0 * np.array(packets) - 1)
+    return np.asarray(clean + rng.normal(0, 2.4, clean.shape))[None]
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_float32_decides_like_float64(seed: int) -> None:
     """LLRs to 1e-3 relative, decisions exactly, away from ties."""
-    metrics = metrics_of(seed).astype(np.float32)
-    single, double = detect.detect(cast(FloatArray, metrics)), detect.detect(metrics.astype(np.float64))
+    llr = llr_of(seed)
+    single, double = detect.detect(llr.astype(np.float32)), detect.detect(llr)
     sure = double.log_prob > np.log(0.5) + _TIE
     assert not (single.index != double.index)[sure].any()
     assert not (single.w != double.w).any()

@@ -15,7 +15,7 @@ from rxcli.errors import InputError, ReceiverError  # noqa: E402
 from rxcli.lab.simulate.pictures import PHOTOS  # noqa: E402
 from rxcli.lab.training import dataset, export, fit, scenes  # noqa: E402
 from rxcli.lab.training.fit import Shape, StripNetwork, n_parameters  # noqa: E402
-from rxcli.protocol import HEADER, bits_per_symbol, codebook, encode_packet  # noqa: E402
+from rxcli.protocol import codebook  # noqa: E402
 from rxcli.receiver.channel.denoise import load_denoiser  # noqa: E402
 
 SMALL = Shape(8, 8, (1, 2), (1, 2))
@@ -61,24 +61,14 @@ def test_samples_tell_what_was_sent(samples: list[dataset.Sample]) -> None:
 
 
 def test_words_are_scored_as_the_detector_would() -> None:
-    """By brute force: the metrics of every slot that a word, or its end, is part of."""
-    rng = np.random.default_rng(5)
-    w, isi_memory, n_symbols = 4, 3, 2
-    bits = rng.integers(0, 2, n_symbols * bits_per_symbol(w), dtype=np.uint8)
-    sent = encode_packet(bits, w)
-    metrics = rng.normal(0, 3, (sent.size + isi_memory, 2 << isi_memory))
-    scores = dataset._word_scores(metrics, sent, w)
-    assert scores.shape == (n_symbols, 128)
-    assert not np.isfinite(scores[:, len(codebook(w)) :]).any()
-    for symbol in range(n_symbols):
-        totals = []
-        for word in codebook(w):
-            tried = np.concatenate([sent, HEADER[:isi_memory]]).astype(int)
-            tried[20 + 10 * symbol : 30 + 10 * symbol] = word
-            index = [int("".join(map(str, tried[i - isi_memory : i + 1])), 2) for i in range(isi_memory, tried.size)]
-            totals.append(metrics[np.arange(isi_memory, tried.size), index].sum())
-        wanted = np.maximum(np.array(totals) - max(totals), -60)
-        np.testing.assert_allclose(scores[symbol, : len(wanted)], wanted, atol=0.05)
+    """By the sum of the ratios of their lit slots, against the best word."""
+    llr = np.random.default_rng(5).normal(0, 3, (2, 10)).astype(np.float32)
+    scores, words = dataset._word_scores(llr, 4), codebook(4)
+    assert scores.shape == (2, 128)
+    assert not np.isfinite(scores[:, len(words) :]).any()
+    for slots, found in zip(llr, scores, strict=True):
+        totals = np.array([slots[word == 1].sum() for word in words])
+        np.testing.assert_allclose(found[: len(words)], np.maximum(totals - totals.max(), -60), atol=0.05)
 
 
 def test_a_network_that_corrects_nothing_leaves_the_light_models_loss(samples: list[dataset.Sample]) -> None:

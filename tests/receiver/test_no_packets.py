@@ -14,7 +14,7 @@ CLOCK = clock_of(3, packet_slots=130, n_slots=260, burst=np.zeros(2, np.int64))
 
 def _first(headers: float) -> Reception:
     posteriors = posteriors_of(1, 3, 11, log_evidence=np.full(3, -1e4), header_llr=np.full((1, 3), headers / 3))
-    nothing = np.zeros((3, 261, 4))
+    nothing = np.zeros((3, 260), np.float32)
     snr = np.zeros((3, 260), np.float32)
     return Reception(CLOCK, None, (snr, snr), posteriors, snr, None, nothing, np.zeros(3, bool))  # type: ignore[arg-type]
 

@@ -15,9 +15,8 @@ from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, usual_screens
-from rxcli.receiver import channel, still
+from rxcli.receiver import still
 from rxcli.receiver.channel import denoise
-from rxcli.receiver.decode import detect
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.passes import Reception, headerless
 from rxcli.receiver.plane.orientation import as_received
@@ -435,10 +434,9 @@ def test_columns_full_of_codewords_have_packets_whether_their_header_shows_or_no
     assert not headerless(reception).any()
     unseen = replace(reception.posteriors, header_llr=np.full_like(reception.posteriors.header_llr, -30.0))
     assert not headerless(replace(reception, posteriors=unseen)).any()
-    metrics = np.roll(reception.metrics, 3, axis=1)
-    detected = detect.detect(channel.by_burst(metrics, reception.clock))
+    detected = still.detected(np.roll(reception.llr, 3, axis=1), reception.clock)
     moved = replace(unseen, log_evidence=detected.log_evidence)
-    assert headerless(replace(reception, posteriors=moved, metrics=metrics)).all()
+    assert headerless(replace(reception, posteriors=moved)).all()
 
 
 @pytest.mark.parametrize("screen", ["paper-8k65", "paper-17k3", "paper-34k6"])

@@ -42,7 +42,7 @@ def test_every_frame_of_a_clip_has_its_taps_and_the_bursts_that_it_reports(
         np.testing.assert_array_equal(taps["geometry.corners"], result.corners)
         assert taps["sampling.inside"].shape == taps["sampling.light"].shape
         assert taps["sampling.rows"].shape == taps["sampling.light"].shape[2:]
-        assert taps["channel.metrics"].shape[0] == taps["sampling.light"].shape[0] == len(result.columns)
+        assert taps["channel.llr"].shape[0] == taps["sampling.light"].shape[0] == len(result.columns)
         assert taps["clock.burst"].max() + 1 == taps["bursts.number"].size
         for column in result.columns:
             for packet in column.packets:

@@ -7,6 +7,7 @@ by the light model, and the word that was sent.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -18,12 +19,11 @@ from rxcli.lab.simulate.camera import Exposure
 from rxcli.lab.simulate.scenes import Scene as SimulatedScene
 from rxcli.lab.training.scenes import SCENE_CLASSES, training_scene, validation_scene
 from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
-from rxcli.receiver.channel import by_burst
 from rxcli.receiver.channel.denoise import DenoiserInput, network_inputs, payload_observed
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.still import decode, doubtful_columns, without_row_noise
-from rxcli.types import Clock, FloatArray
+from rxcli.types import Clock, Float32Array
 
 #: Words of the largest codebook, and what stands for a word that is not known.
 MAX_WORDS, UNKNOWN = 128, -1
@@ -77,17 +77,18 @@ def frame_samples(n_frames: int, seed: int, folder: Path, *, progress: bool = Tr
 
 
 def validation_samples(n_frames: int, folder: Path, *, progress: bool = True) -> list[Sample]:
-    """Samples of pictures and cameras not trained on, all scene classes in turn.
+    """Samples of the first validation frames."""
+    return list(_cached(validation_sample, n_frames, folder / "validation", "validation", progress))
 
-    They hold columns that the receiver uses the network for; training also uses hopeless ones.
+
+def validation_sample(number: int) -> Sample | None:
+    """Sample of a picture and a camera not trained on, all scene classes in turn, or None.
+
+    It holds columns that the receiver uses the network for; training also uses hopeless ones.
     """
-
-    def make(number: int) -> Sample | None:
-        turn, kind = divmod(number, len(SCENE_CLASSES))
-        scene = validation_scene(SCENE_CLASSES[kind], _SCREENS[turn % 2], turn // 2)
-        return _simulated(scene, _VALIDATION + number)
-
-    return list(_cached(make, n_frames, folder / "validation", "validation", progress))
+    turn, kind = divmod(number, len(SCENE_CLASSES))
+    scene = validation_scene(SCENE_CLASSES[kind], _SCREENS[turn % 2], turn // 2)
+    return _simulated(scene, _VALIDATION + number)
 
 
 def _cached(make: Callable[[int], Sample | None], n: int, folder: Path, what: str, progress: bool) -> Iterator[Sample]:
@@ -140,12 +141,12 @@ def sample_of(
     lit, dark = (clock.by_burst(part.astype(np.int64)) for part in (slots[columns], 1 - slots[columns]))
     if (lit * dark).any():
         return None
-    bursts = by_burst(scene.metrics[columns], clock)
+    bursts = clock.by_burst(scene.llr[columns])
     scores, words = [], []
     for burst in range(bursts.shape[0]):
         for row, w in enumerate(weights[columns]):
             sent = (lit[burst, row] > 0).astype(np.uint8)
-            scores.append(_word_scores(bursts[burst, row], sent, int(w)))
+            scores.append(_word_scores(_payload(bursts[burst, row]), int(w)))
             word = (codebook(int(w)).astype(np.int64) @ _payload(sent).T).argmax(axis=0)
             words.append(np.where(_payload(lit[burst, row] + dark[burst, row]).all(axis=1), word, UNKNOWN))
     shape = (*bursts.shape[:2], len(words[0]))
@@ -163,34 +164,19 @@ def sample_of(
     )
 
 
-def _payload(packet: NDArray[np.integer]) -> NDArray[np.int64]:
+def _payload(packet: NDArray[Any]) -> NDArray[Any]:
     """(symbols, 10) slots of a packet."""
-    return packet[PREAMBLE_SLOTS:].reshape(-1, SLOTS_PER_SYMBOL).astype(np.int64)
+    return packet[PREAMBLE_SLOTS:].reshape(-1, SLOTS_PER_SYMBOL)
 
 
-def _word_scores(metrics: FloatArray, sent: NDArray[np.uint8], w: int) -> NDArray[np.float16]:
-    """(symbols, 128) log-likelihood of every word of weight `w` by the light model, the slots around it being known.
+def _word_scores(llr: Float32Array, w: int) -> NDArray[np.float16]:
+    """(symbols, 128) log-likelihood of every word of weight `w` by the slots (symbols, 10), against the best one.
 
-    Against the best word; -inf where there is no word.
-
-    Args:
-        metrics: (packet + memory, patterns), copies added.
-        sent: (packet,) the slots that were sent.
-        w: weight.
+    -inf where there is no word.
     """
-    isi_memory = metrics.shape[0] - sent.size
-    words = codebook(w)
-    around = np.concatenate([sent, np.array(HEADER[:isi_memory], np.uint8)])
-    out = np.full((len(_payload(sent)), MAX_WORDS), -np.inf)
-    for symbol in range(len(out)):
-        at = PREAMBLE_SLOTS + symbol * SLOTS_PER_SYMBOL
-        slots = np.repeat(around[None, at - isi_memory : at + SLOTS_PER_SYMBOL + isi_memory], len(words), axis=0)
-        slots[:, isi_memory : isi_memory + SLOTS_PER_SYMBOL] = words
-        windows = np.lib.stride_tricks.sliding_window_view(slots.astype(np.int64), isi_memory + 1, axis=1)
-        pattern = windows @ (1 << np.arange(isi_memory, -1, -1))
-        place = np.arange(at, at + SLOTS_PER_SYMBOL + isi_memory)
-        score = metrics[place, pattern].sum(axis=1)
-        out[symbol, : len(words)] = np.maximum(score - score.max(), _MIN_SCORE)
+    score = llr @ codebook(w).T
+    out = np.full((len(score), MAX_WORDS), -np.inf)
+    out[:, : score.shape[1]] = np.maximum(score - score.max(axis=1, keepdims=True), _MIN_SCORE)
     return out.astype(np.float16)
 
 

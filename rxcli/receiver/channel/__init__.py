@@ -11,28 +11,28 @@ The picture is predicted at every sample from earlier samples, from later sample
 itself. Each prediction uses the scale with the smallest local error, and that error is the variance of the prediction.
 The likelihood of a sample is a mixture over the three predictions, because at an edge of the picture only one side is
 valid. Its density is Student-t, so that an edge in one strip does not outweigh the other strips. The metric of a slot
-pattern is the sum of the log-likelihoods over strips and samples.
+pattern is the sum of the log-likelihoods over strips and samples. What the channel hands on is the log-likelihood ratio
+of every slot by itself, each with its neighbours as likely as their own light has them.
 
-The prediction of the picture needs the slots, so model and detection are iterated. The initial metrics compare every
+The prediction of the picture needs the slots, so model and detection are iterated. The initial ratios compare every
 sample with its local extremes.
 
 `model` holds the parameters of a frame, `steady` takes off light that does not blink, `picture` predicts the picture,
-`likelihoods` computes metrics, and `patterns` converts slots and metrics between the frame's grid and bursts.
+`likelihoods` computes metrics, and `patterns` turns these into ratios of slots.
 """
 
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods
 from rxcli.receiver.channel.model import ObservationModel, estimate_black_level, estimate_tails
-from rxcli.receiver.channel.patterns import by_burst, initial_metrics, metrics_of
+from rxcli.receiver.channel.patterns import initial_llr, llr_of
 from rxcli.receiver.channel.steady import without_steady_light
 
 __all__ = [
     "ObservationModel",
     "SlotLikelihoods",
-    "by_burst",
     "estimate_black_level",
     "estimate_tails",
-    "initial_metrics",
-    "metrics_of",
+    "initial_llr",
+    "llr_of",
     "slot_likelihoods",
     "without_steady_light",
 ]

@@ -31,9 +31,9 @@ from rxcli.protocol import HEADER, PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.model import Expected, ObservationModel
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
-from rxcli.receiver.light import NoiseModel, slot_llr
+from rxcli.receiver.light import NoiseModel
 from rxcli.resources import data_dir, onnx_runtime
-from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
+from rxcli.types import Clock, Float32Array, SlotSamples
 
 #: Default model.
 DEFAULT_MODEL = "strips"
@@ -61,8 +61,8 @@ class DenoiserInput:
     clock: Clock
     #: (C, N) probability that each slot is lit, without the network.
     lit: Float32Array
-    #: (C, N + memory, patterns) log-likelihood of every pattern of slots n - memory .. n by the light model.
-    metrics: FloatArray
+    #: (C, N) log-likelihood ratio of each slot by the light model.
+    llr: Float32Array
     #: (C,) most likely weight.
     w: NDArray[np.int64]
     model: ObservationModel
@@ -183,7 +183,7 @@ def _column_features(
     """(B, 16, N) features of columns, see `COLUMN_FEATURES`, from (B, S, n) values."""
     q, clock = scene.samples.samples_per_slot, scene.clock
     lit = np.clip(scene.lit[columns], _MIN_DOUBT, 1 - _MIN_DOUBT)
-    llr = slot_llr(scene.metrics[columns], lit)
+    llr = scene.llr[columns]
     # Slope of a Student-t log-density with four degrees of freedom, which limits outliers.
     pull = residual / (1 + residual * residual / np.float32(4))
     place = clock.places % SLOTS_PER_SYMBOL

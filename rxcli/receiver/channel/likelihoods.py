@@ -1,4 +1,4 @@
-"""Likelihood of the light for every slot pattern, each slot separately."""
+"""Likelihood ratio of every slot, from that of the light for every slot pattern."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import MIN_FLOAT32
 from rxcli.receiver.channel.model import Expected, ObservationModel
-from rxcli.receiver.channel.patterns import by_pattern
+from rxcli.receiver.channel.patterns import by_pattern, slot_llr
 from rxcli.receiver.channel.picture import PER_SLOT, PictureSums, Prediction, by_place, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
@@ -20,10 +20,10 @@ _DEGREES = 4.0
 
 @dataclass(frozen=True, slots=True)
 class SlotLikelihoods:
-    """Log-likelihoods of the slots of some columns."""
+    """What the light of some columns shows of their slots."""
 
-    #: (C, N + memory, patterns) float64: log-likelihood of every pattern of slots n - memory .. n.
-    metrics: FloatArray
+    #: (C, N) log-likelihood ratio of every slot being lit; 0 where it is not visible.
+    llr: Float32Array
     #: (C, N) float32: squared contrast of a slot over its noise variance; (C, 1) if common to all slots.
     snr: Float32Array
     #: (C, 2) float64: correlation of the residuals with their derivative by time, and power of that derivative; their
@@ -40,7 +40,7 @@ def slot_likelihoods(
     *,
     is_initial: bool = False,
 ) -> SlotLikelihoods:
-    """Log-likelihood of every slot pattern at every slot, given the current estimate of all slots.
+    """Log-likelihood ratio of every slot, given the picture by the current estimate of all slots.
 
     Args:
         samples: samples of `columns`, S strips, N slots of Q samples.
@@ -57,7 +57,8 @@ def slot_likelihoods(
     sums = PictureSums.of(observed.light, observed.whole, observed.valid)
     prediction = predict_picture(sums, model.noise.dark_variance, scales, one_sided=not is_initial)
     late = np.zeros((0, 2)) if observed.slope is None else _timing(observed, observed.slope, prediction)
-    return SlotLikelihoods(_pattern_metrics(observed, prediction), _slot_snr(observed, prediction), late)
+    llr = slot_llr(_pattern_metrics(observed, prediction), None if is_initial else lit[columns])
+    return SlotLikelihoods(llr, _slot_snr(observed, prediction), late)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +110,7 @@ def _timing(observed: _Observed, slope: Float32Array, prediction: Prediction) ->
     return np.stack([term.sum(axis=(0, -2, -1), dtype=np.float64) for term in terms], axis=1)
 
 
-def _pattern_metrics(observed: _Observed, prediction: Prediction) -> FloatArray:
+def _pattern_metrics(observed: _Observed, prediction: Prediction) -> Float32Array:
     """Mixture log-likelihoods summed over strips and the samples of a metric; (C, N + memory, patterns)."""
     exposure, noise = observed.model.exposure, observed.model.noise
     weight = np.float32(SETTINGS.slot_information / exposure.samples_per_slot) * observed.valid

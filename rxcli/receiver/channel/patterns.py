@@ -1,18 +1,66 @@
-"""Metrics of slot patterns, and their conversion between the grid of a frame and bursts."""
+"""Log-likelihood ratios of slots from the likelihoods of slot patterns, which resolves inter-symbol interference."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 
+from rxcli.numerics import MIN_FLOAT32
 from rxcli.protocol import slot_patterns
 from rxcli.receiver.light import Exposure
-from rxcli.types import Clock, Float32Array, FloatArray
+from rxcli.types import Float32Array
+
+#: Passes over the slots, each with the neighbours as the pass before has them.
+_PASSES = 3
+#: Least distance of a slot's probability from 0 and 1, and the largest log-likelihood ratio.
+_MIN_DOUBT = 1e-4
+_MAX_LLR = np.float32(np.log(1 / _MIN_DOUBT - 1))
 
 
-def initial_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposure) -> FloatArray:
-    """Initial metrics (C, N + memory, patterns), from contrast alone.
+def llr_of(lit: Float32Array) -> Float32Array:
+    """Log-likelihood ratios of slots from their probabilities."""
+    bounded = np.clip(lit, _MIN_DOUBT, 1 - _MIN_DOUBT)
+    return np.asarray(np.log(bounded) - np.log1p(-bounded), np.float32)
+
+
+def slot_llr(metrics: Float32Array, lit: Float32Array | None = None) -> Float32Array:
+    """(C, N) log-likelihood ratio of each slot being lit by its own light.
+
+    A slot contributes to its own metric and to the `isi_memory` metrics after it; their ratios are added.
+
+    Args:
+        metrics: (C, N + memory, patterns) log-likelihood of every pattern of slots n - memory .. n.
+        lit: (C, N) probability that each slot is lit, as far as it concerns its neighbours; None: by their own light.
+    """
+    isi_memory = int(metrics.shape[-1]).bit_length() - 2
+    n_columns, n_metrics, n_patterns = metrics.shape
+    is_lit, n_slots = _lit_by_age(isi_memory), n_metrics - isi_memory
+    # Patterns first: long vectors although patterns are few.
+    by_pattern = np.ascontiguousarray(metrics.reshape(-1, n_patterns).T, np.float32)
+    is_shown = np.ptp(by_pattern, axis=0).reshape(n_columns, n_metrics) > 0
+    llr = np.zeros((n_columns, n_slots), np.float32) if lit is None else llr_of(lit)
+    for _ in range(_PASSES if lit is None else 1):
+        prior = np.pad(np.clip(llr, -_MAX_LLR, _MAX_LLR), ((0, 0), (isi_memory, isi_memory)))
+        odds = np.stack([prior[:, isi_memory - age :][:, :n_metrics] for age in range(isi_memory + 1)])
+        likelihood = is_lit.T @ odds.reshape(isi_memory + 1, -1)
+        likelihood += by_pattern
+        likelihood -= likelihood.max(axis=0)
+        np.exp(likelihood, out=likelihood)
+        gained = np.log(is_lit @ likelihood + MIN_FLOAT32) - np.log((1 - is_lit) @ likelihood + MIN_FLOAT32)
+        gained = (gained.reshape(odds.shape) - odds) * is_shown
+        llr = np.asarray(sum(of_age[:, age : age + n_slots] for age, of_age in enumerate(gained)), np.float32)
+    return llr
+
+
+@cache
+def _lit_by_age(isi_memory: int) -> Float32Array:
+    """(memory + 1, patterns): 1 where the slot `age` slots ago is lit."""
+    return np.ascontiguousarray(slot_patterns(isi_memory)[:, ::-1].T, np.float32)
+
+
+def initial_llr(pooled: Float32Array, weight: Float32Array, exposure: Exposure) -> Float32Array:
+    """(C, N) initial log-likelihood ratio of each slot being lit, from contrast alone.
 
     Args:
         pooled: (C, N * Q) light between its local extremes, -1 dark to 1 lit.
@@ -27,10 +75,10 @@ def initial_metrics(pooled: Float32Array, weight: Float32Array, exposure: Exposu
     def of_level(place: int, level: float) -> Float32Array:
         return np.asarray(-np.square(pooled[:, place::q] - np.float32(2 * level - 1)) * precision[:, place::q])
 
-    return by_pattern(exposure, of_level)
+    return slot_llr(by_pattern(exposure, of_level))
 
 
-def by_pattern(exposure: Exposure, of_level: Callable[[int, float], Float32Array]) -> FloatArray:
+def by_pattern(exposure: Exposure, of_level: Callable[[int, float], Float32Array]) -> Float32Array:
     """(C, N + memory, patterns) log-likelihood of every pattern, summed over the samples of a metric.
 
     Args:
@@ -44,7 +92,7 @@ def by_pattern(exposure: Exposure, of_level: Callable[[int, float], Float32Array
     of_metrics = np.zeros((n_columns, len(by_level), n_slots + exposure.isi_memory), np.float32)
     for number, (metric, values) in enumerate(zip(plan.metrics, by_level, strict=True)):
         of_metrics[:, number, metric : metric + n_slots] = values
-    return np.asarray(of_metrics.swapaxes(1, 2) @ plan.shares, np.float64)
+    return np.asarray(of_metrics.swapaxes(1, 2) @ plan.shares)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,27 +124,3 @@ def _level_plan(taps: bytes, samples_per_slot: int) -> _LevelPlan:
         evaluated += levels.tolist()
         shares.append(np.eye(levels.size)[number].T)
     return _LevelPlan(places, evaluated, metrics, np.concatenate(shares).astype(np.float32))
-
-
-def metrics_of(llr: Float32Array, isi_memory: int) -> FloatArray:
-    """Metrics (C, N + memory, patterns) of independent slots, from their log-likelihood ratios (C, N)."""
-    padded = np.pad(llr, ((0, 0), (0, isi_memory)))
-    return np.asarray(padded[..., None] / 2 * (2.0 * slot_patterns(isi_memory)[:, -1] - 1))
-
-
-def by_burst(metrics: FloatArray, clock: Clock) -> FloatArray:
-    """Add the metrics of the grid (C, N + memory, patterns) over the copies of each burst.
-
-    Returns:
-        (B, C, packet + memory, patterns); see `detect.detect`.
-    """
-    n_columns, n_metrics, n_patterns = metrics.shape
-    length, isi_memory = clock.packet_slots, n_metrics - clock.n_slots
-    padded = np.zeros((n_columns, clock.n_copies * length + isi_memory, n_patterns))
-    end = min(clock.first_slot + metrics.shape[1], padded.shape[1])
-    padded[:, clock.first_slot : end] = metrics[:, : end - clock.first_slot]
-    out = np.zeros((int(clock.burst.max()) + 1, n_columns, length + isi_memory, n_patterns))
-    for copy, burst in enumerate(clock.burst):
-        out[burst] += padded[:, copy * length : (copy + 1) * length + isi_memory]
-    out[:, :, :isi_memory] = 0
-    return out

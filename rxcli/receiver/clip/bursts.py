@@ -9,13 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from rxcli.protocol import PREAMBLE_SLOTS
-from rxcli.receiver import channel
+from rxcli.receiver.channel import llr_of
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View
 from rxcli.receiver.decode import assemble, confidence, detect
-from rxcli.receiver.frame.settings import SETTINGS as pass_settings
-from rxcli.receiver.light import slot_llr
-from rxcli.receiver.still import llr_of
 from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, IntArray
 
 
@@ -25,8 +22,8 @@ class Burst:
 
     #: Number in the clip.
     number: int
-    #: (C, packet + memory, patterns) of all frames together.
-    metrics: FloatArray
+    #: (C, packet) log-likelihood ratio of every slot, of all frames together.
+    llr: FloatArray
     #: (C, packet) number of observations of each slot.
     n_observed: IntArray
     frames: tuple[int, ...]
@@ -38,7 +35,7 @@ class Burst:
     def __add__(self, burst: Burst) -> Burst:
         return Burst(
             self.number,
-            self.metrics + burst.metrics,
+            self.llr + burst.llr,
             self.n_observed + burst.n_observed,
             self.frames + burst.frames,
             np.union1d(self.copies, burst.copies),
@@ -48,12 +45,7 @@ class Burst:
     @cached_property
     def posteriors(self) -> BurstPosteriors:
         """Of this burst alone."""
-        metrics = self.metrics[None]
-        return detect.detect(metrics, detect.plausible_weights(metrics, pass_settings.weight_margin, self._llr))
-
-    @cached_property
-    def _llr(self) -> Float32Array:
-        return slot_llr(self.metrics[None])
+        return detect.detect(self.llr[None])
 
     @property
     def certain(self) -> BoolArray:
@@ -68,17 +60,13 @@ class Burst:
         """What is reported of it; `view` is of the last frame that shows it."""
         assert view.numbers is not None
         features = against = None
+        margin = (np.where(self.posteriors.lit[0] > 0.5, self.llr, -self.llr)[:, PREAMBLE_SLOTS:]).astype(np.float32)
         if self.tracked:
-            decided = np.sign(self.posteriors.lit[0, :, PREAMBLE_SLOTS:] - 0.5)
-            against = np.maximum(-self._llr[0, :, PREAMBLE_SLOTS:] * decided, 0).max(axis=1)
+            against = np.maximum(-margin, 0).max(axis=1)
         else:
-            margin = detect.slot_margin(self.metrics[None], self.posteriors.lit > 0.5)[:, :, PREAMBLE_SLOTS:]
-            undenoised, joint = (
-                np.zeros(margin.shape[1], bool),
-                np.full(margin.shape[1], view.joint is not None),
-            )
+            undenoised, joint = np.zeros(len(margin), bool), np.full(len(margin), view.joint is not None)
             n_strips = view.acquisition.binned.light.shape[1]
-            features = confidence.confidence_features(self.posteriors, margin, undenoised, n_strips, joint)[0]
+            features = confidence.confidence_features(self.posteriors, margin[None], undenoised, n_strips, joint)[0]
         index = self.number - int(view.numbers[0])
         return confidence.BurstInView(
             self.number, index, self.posteriors, self.n_observed, self.frames, features, against
@@ -88,7 +76,7 @@ class Burst:
 def bursts_of(view: View) -> list[Burst]:
     """What a frame shows of its bursts."""
     assert view.numbers is not None
-    metrics = channel.by_burst(view.metrics, view.clock)
+    llr = view.clock.by_burst(view.llr)
     shows_payload = view.shown[..., PREAMBLE_SLOTS:].any(axis=(1, 2))
     # Copies that were detected together under another assignment count by themselves.
     joint = view.joint if view.joint and np.array_equal(view.joint.burst, view.clock.burst) else None
@@ -96,11 +84,8 @@ def bursts_of(view: View) -> list[Burst]:
     for index, number in enumerate(view.numbers.tolist()):
         which = view.clock.burst == index
         copies, n_observed = view.first_copy + np.flatnonzero(which & shows_payload), view.shown[which].sum(axis=0)
-        evidence = metrics[index]
-        if joint is not None:
-            llr = llr_of(joint.posteriors.lit[index]) * (n_observed > 0)
-            evidence = channel.metrics_of(llr, int(metrics.shape[-1]).bit_length() - 2)
-        bursts.append(Burst(number, evidence, n_observed, (view.context.frame.index,), copies, view.tracked))
+        own = llr[index] if joint is None else llr_of(joint.posteriors.lit[index]) * (n_observed > 0)
+        bursts.append(Burst(number, own, n_observed, (view.context.frame.index,), copies, view.tracked))
     return bursts
 
 

@@ -17,14 +17,13 @@ from rxcli.receiver.clip.acquiring import FirstFrames
 from rxcli.receiver.clip.camera import Acquired, ClipCamera, Located
 from rxcli.receiver.clip.common_clock import common_clock, hides_headers, start_by
 from rxcli.receiver.clip.ledger import Ledger
-from rxcli.receiver.clip.scene import TrackedScreen, by_copy_metrics
+from rxcli.receiver.clip.scene import TrackedScreen, by_copy_llr
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import JointSlots, View, Waiting, decides_jointly
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.passes import shows_steady_light
 from rxcli.receiver.frame.result import Failure
-from rxcli.receiver.light import slot_llr
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found
 from rxcli.receiver.still import apply_autoencoder, decode
@@ -286,14 +285,12 @@ def _receive_anew(
     if assemble.all_dark(reception.snr):
         return Lost(known), Failure(Remark("nothing_lit")), None
     known = replace(known, outline=located.outline)
-    metrics = reception.metrics
-    if is_joint:
-        metrics = by_copy_metrics(np.asarray(0.5 + 0.5 * np.tanh(slot_llr(metrics) / 2), np.float32))
+    llr = by_copy_llr(np.float32(0.5) * (1 + np.tanh(np.float32(0.5) * reception.llr))) if is_joint else reception.llr
     view = View(
         acquired.context,
         acquisition,
         reception.clock,
-        metrics,
+        llr,
         np.minimum(assemble.slots_observed(reception.samples, reception.clock.by_copy), 1),
         reception.snr,
         denoised,

@@ -74,6 +74,6 @@ def _taps(result: FrameResult, view: View, ended: Sequence[BurstInView]) -> dict
     else:
         found["sampling"] = view.acquisition.profiles
     numbers: IntArray = np.array([burst.number for burst in ended], np.int64)
-    found |= {"channel.metrics": view.metrics, "bursts.shown": view.shown}
+    found |= {"channel.llr": view.llr, "bursts.shown": view.shown}
     found |= {"bursts.number": view.numbers, "bursts.ended": numbers}
     return found | {f"detect.{burst.number}": burst.posteriors for burst in ended}

@@ -9,8 +9,8 @@ from operator import itemgetter
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.receiver import channel, plane
-from rxcli.receiver.channel import ObservationModel, known_picture
+from rxcli.receiver import plane
+from rxcli.receiver.channel import ObservationModel, known_picture, llr_of
 from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture, Update
 from rxcli.receiver.clip.place import ScreenPlace
 from rxcli.receiver.clip.settings import SETTINGS
@@ -32,7 +32,6 @@ from rxcli.receiver.still import (
     in_bursts,
     initial_pass,
     lateness,
-    llr_of,
 )
 from rxcli.receiver.sync import tracking
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray, Outlines
@@ -174,14 +173,14 @@ class TrackedScreen:
             measured = self._measured(picture, observed, clock, None, max_misfit)
             if measured is None:
                 return None
-            clock, metrics, snr = measured.clock, measured.metrics, measured.snr
+            clock, llr, snr = measured.clock, measured.llr, measured.snr
             self._measure_place(picture, light, measured.expected)
             shown = _shown(pose.map.inside, known_picture.row_positions(pose.rows, clock), clock)
         return View(
             replace(last.context, cache=cache, sampled_corners=self.corners),
             replace(last.acquisition, clock=clock),
             clock,
-            metrics,
+            llr,
             shown,
             snr,
             light=light,
@@ -213,8 +212,8 @@ class TrackedScreen:
             single = replace(acquisition, clock=clock.by_copy)
             found, snr = detect_jointly(single, model, weights, None)
             lit = single.clock.on_grid(found.lit)
-            metrics = by_copy_metrics(lit)
-            clock = in_bursts(acquisition, clock, metrics) if bursts is None else replace(clock, burst=bursts)
+            llr = by_copy_llr(lit)
+            clock = in_bursts(acquisition, clock, llr) if bursts is None else replace(clock, burst=bursts)
             found, _ = detect_jointly(replace(acquisition, clock=clock), model, weights, lit)
             if self._changes:  # A picture that is wrong in detail is worse than none.
                 free, _ = detect_jointly(self._acquired(observed.light, pose, None, clock), model, weights, lit)
@@ -234,7 +233,7 @@ class TrackedScreen:
             replace(self.last.context, cache=cache, sampled_corners=self.corners),
             replace(self.last.acquisition, clock=clock),
             clock,
-            metrics,
+            llr,
             shown,
             snr,
             light=observed.light,
@@ -266,13 +265,13 @@ class TrackedScreen:
         adapted = self._measured_by(shown, observed, clock, lit, max_misfit, adapts=True)
         if adapted is None:
             return known
-        found, changed = adapted, np.ones(len(adapted.metrics), bool)
+        found, changed = adapted, np.ones(len(adapted.llr), bool)
         if known is not None:
             changed = (picture.excess >= SETTINGS.changed_misfit) & (adapted.information > known.information)
             found = known.with_columns(changed, adapted)
             if changed.mean() > 0.5:
                 self._n_changed = SETTINGS.look_every
-        return replace(found, metrics=self._with_doubtful(observed, found.clock, found.metrics, changed))
+        return replace(found, llr=self._with_doubtful(observed, found.clock, found.llr, changed))
 
     def _measured_by(
         self,
@@ -308,19 +307,19 @@ class TrackedScreen:
         if judged is None:
             return None
         found = known_picture.slot_likelihoods(judged, expected, clock, isi_memory)
-        return _Measured(clock, found.metrics, found.snr, expected.light, judged.precision.sum(axis=1))
+        return _Measured(clock, found.llr, found.snr, expected.light, judged.precision.sum(axis=1))
 
-    def _with_doubtful(self, observed: _Observed, clock: Clock, metrics: FloatArray, changed: BoolArray) -> FloatArray:
-        """Metrics, those of doubtful `changed` (C,) columns by two joint detections without a picture.
+    def _with_doubtful(self, observed: _Observed, clock: Clock, llr: Float32Array, changed: BoolArray) -> Float32Array:
+        """Slots, those of doubtful `changed` (C,) columns by two joint detections without a picture.
 
         One sees the strips that were read, one those of a photograph. They err unlike, and share the noise: their mean
         counts.
         """
-        found = detected(metrics, clock)
+        found = detected(llr, clock)
         doubts = found.log_prob.sum(axis=2).min(axis=0) < SETTINGS.doubtful_log_prob
         doubtful = np.flatnonzero(doubts & changed)
         if not doubtful.size:
-            return metrics
+            return llr
         strips = self._acquired(observed.light, observed.pose, None, clock)
         weights = np.maximum(found.w_log_prob, self._w_log_prob)
         joint, _ = detect_jointly(strips, self._model(clock), weights, clock.on_grid(found.lit), doubtful)
@@ -331,9 +330,9 @@ class TrackedScreen:
         photograph = decode(acquisition, _SKIPPED_OF_FILM, initial).posteriors.of_columns(doubtful)
         of_each = replace(clock, delay_slots=clock.delay_slots[doubtful])
         # The copies of a burst were added up already.
-        llr = (llr_of(joint.lit) + llr_of(photograph.lit)) / 2 / np.bincount(clock.burst)[:, None, None]
-        metrics[doubtful] = channel.metrics_of(of_each.on_grid(llr), self._isi_memory)
-        return metrics
+        mean = (llr_of(joint.lit) + llr_of(photograph.lit)) / 2 / np.bincount(clock.burst)[:, None, None]
+        llr[doubtful] = of_each.on_grid(mean)
+        return llr
 
     def _measure_place(self, picture: PlacedPicture, light: Float32Array, expected: Float32Array) -> None:
         """Correct the screen's place by the columns' light as `expected` from decided slots (C, R)."""
@@ -529,7 +528,7 @@ class TrackedScreen:
         observed = _Observed(view.context, pose, view.light, picture, columns, view.changed)
         measured = self._measured(picture, observed, clock, known, SETTINGS.misfit)
         if measured is not None:
-            view.clock, view.snr, view.metrics, view.tracked = measured.clock, measured.snr, measured.metrics, True
+            view.clock, view.snr, view.llr, view.tracked = measured.clock, measured.snr, measured.llr, True
 
 
 @dataclass(frozen=True, slots=True)
@@ -552,8 +551,8 @@ class _Measured:
     """Slots by the light of a frame."""
 
     clock: Clock
-    #: (C, N + memory, patterns), and (C, 1) squared contrast over variance of a slot.
-    metrics: FloatArray
+    #: (C, N) log-likelihood ratio of every slot, and (C, 1) squared contrast over variance of a slot.
+    llr: Float32Array
     snr: Float32Array
     #: (C, R) light of the columns by the decided slots; and (C,) information on the slots: its precision.
     expected: Float32Array
@@ -567,14 +566,14 @@ class _Measured:
                 getattr(given, name),
                 getattr(self, name),
             )
-            for name in ("metrics", "snr", "expected", "information")
+            for name in ("llr", "snr", "expected", "information")
         }
         return replace(self, **fields)
 
 
-def by_copy_metrics(lit: Float32Array) -> FloatArray:
-    """Metrics of slots (C, N) of a long exposure: some are wrong, however sure."""
-    return channel.metrics_of(llr_of(0.5 + (1 - 2 * np.float32(SETTINGS.wrong_slots)) * (lit - 0.5)), 1)
+def by_copy_llr(lit: Float32Array) -> Float32Array:
+    """Log-likelihood ratios of slots (C, N) of a long exposure: some are wrong, however sure."""
+    return llr_of(0.5 + (1 - 2 * np.float32(SETTINGS.wrong_slots)) * (lit - 0.5))
 
 
 def _header_contrast(columns: ColumnLight, rows: FloatArray, clock: Clock) -> float:

@@ -12,7 +12,6 @@ from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View
 from rxcli.receiver.decode import assemble, confidence
 from rxcli.receiver.decode.settings import SETTINGS as decode_settings
-from rxcli.receiver.light import slot_llr
 from rxcli.receiver.search.framing import log_odds
 from rxcli.receiver.sync import tracking
 from rxcli.receiver.sync.settings import SETTINGS as sync_settings
@@ -25,7 +24,7 @@ class Timeline:
 
     time: tracking.LinkTime
     phase: tracking.BurstPhase
-    #: Columns, slots of a packet and patterns of the metrics; another screen is seen where these differ.
+    #: Columns, and slots of a packet; another screen is seen where these differ.
     shape: tuple[int, ...]
     #: Number of burst 0 of this time in the clip, and the lowest number above all bursts so far.
     offset: int = 0
@@ -88,7 +87,7 @@ class Timeline:
         view.first_copy, self.last_time_s = first_copy, frame.time_s
         is_judged = len(self.first_copies) >= sync_settings.n_judged_clocks
         if not (self.phase.settled and is_judged):
-            copies = view.clock.to_copies(slot_llr(view.metrics)).transpose(1, 0, 2)
+            copies = view.clock.to_copies(view.llr).transpose(1, 0, 2)
             shown = np.asarray(copies * (view.shown > 0), np.float64)
             if not self.phase.settled:  # Bursts that were numbered keep their numbers.
                 self.phase.update(first_copy, shown)
@@ -153,4 +152,4 @@ class Timeline:
 
 
 def _shape(view: View) -> tuple[int, ...]:
-    return view.acquisition.screen.columns, view.clock.packet_slots, view.metrics.shape[-1]
+    return view.acquisition.screen.columns, view.clock.packet_slots

@@ -59,8 +59,8 @@ class View:
     context: FrameContext
     acquisition: Acquisition
     clock: Clock
-    #: (C, N + memory, patterns).
-    metrics: FloatArray
+    #: (C, N) log-likelihood ratio of every slot being lit.
+    llr: Float32Array
     #: (n_copies, C, packet) int: 1 where the slot is on the screen and in the picture.
     shown: IntArray
     #: (C, N) squared contrast over variance of every slot; (C, 1) of a tracked frame.
@@ -77,7 +77,7 @@ class View:
     changed: bool = False
     #: Number of the frame's copy 0 in the clip.
     first_copy: int = 0
-    #: Of a long exposure; the metrics are then those of every copy by itself.
+    #: Of a long exposure; the slots are then those of every copy by itself.
     joint: JointSlots | None = None
     #: How sure the length of packets is by this frame alone; None where the picture was known.
     framing: Framing | None = None

@@ -1,1 +1,1 @@
-"""Slot metrics to symbols (`detect`), and symbols to packets with their confidence (`assemble`)."""
+"""Slots to symbols (`detect`), and symbols to packets with their confidence (`assemble`)."""

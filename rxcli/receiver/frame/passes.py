@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.profiles import ScreenProfile
-from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
+from rxcli.protocol import PREAMBLE_SLOTS
 from rxcli.receiver import channel
 from rxcli.receiver.channel import denoise
-from rxcli.receiver.decode import assemble, confidence, detect
+from rxcli.receiver.decode import assemble, confidence
 from rxcli.receiver.decode.settings import SETTINGS as decode_settings
 from rxcli.receiver.decode.soft_bits import assume_unobserved_certain, still_soft_bits
 from rxcli.receiver.decode.steady import is_steady
@@ -33,7 +33,7 @@ from rxcli.types import (
 
 @dataclass(frozen=True)
 class Reception:
-    """Samples, posteriors and metrics of a frame on a given clock."""
+    """Samples, slots and posteriors of a frame on a given clock."""
 
     clock: Clock
     #: Samples of the initial pass: strips binned in pairs.
@@ -45,30 +45,21 @@ class Reception:
     snr: Float32Array
     #: Observation model of the samples.
     model: channel.ObservationModel
-    #: (C, N + memory, patterns).
-    metrics: FloatArray
+    #: (C, N) log-likelihood ratio of every slot being lit, of every copy by itself.
+    llr: Float32Array
     #: (C,) columns whose slots and picture were detected jointly, see `decode.survivors`.
     joint: BoolArray
-    #: (C,) log evidence of arbitrary slots where all columns were detected so from the start; None: by the metrics.
-    free_log_evidence: FloatArray | None = None
+    #: Whether exposures last several slots, so that all columns were detected jointly from the start.
+    is_long: bool = False
     #: Assignments of the copies to bursts, each with its log evidence by joint detection; none: by their similarity.
     bursts_by_evidence: Sequence[tuple[IntArray, float]] = ()
     #: Skipped steps: name -> number of columns.
     skipped: dict[str, int] = field(default_factory=dict)
 
     @property
-    def is_long(self) -> bool:
-        """Whether exposures last several slots, so that all columns were detected jointly from the start."""
-        return self.free_log_evidence is not None
-
-    @cached_property
-    def column_llr(self) -> FloatArray:
-        """(C,) log-likelihood ratio of each column containing packets against arbitrary slots."""
-        if self.free_log_evidence is not None:
-            return self.posteriors.log_evidence - self.free_log_evidence
-        packets = self.posteriors.log_evidence - np.log(len(WEIGHTS))
-        share = self.posteriors.w / SLOTS_PER_SYMBOL
-        return np.asarray(packets - detect.free_log_evidence(self.metrics, share))
+    def header_llr(self) -> FloatArray:
+        """(B, C) log-likelihood ratio of headers; (1, C) of packets where exposures are too long to show headers."""
+        return self.posteriors.log_evidence[None] if self.is_long else self.posteriors.header_llr
 
     @cached_property
     def n_observed(self) -> IntArray:
@@ -106,7 +97,7 @@ class Reception:
     def _slot_margin(self) -> Float32Array:
         """(B, C, N) log-likelihood ratio of each burst's payload slots as decided against their opposite."""
         decided = self.clock.on_grid(self.posteriors.lit) > 0.5
-        return assemble.slot_margin_by_burst(detect.slot_margin(self.metrics, decided), self.clock)
+        return assemble.slot_margin_by_burst(np.where(decided, self.llr, -self.llr), self.clock)
 
     def of_columns(self, columns: IntArray) -> Reception:
         """The reception of some columns."""
@@ -117,15 +108,14 @@ class Reception:
             contrast=(self.contrast[0][columns], self.contrast[1][columns]),
             posteriors=self.posteriors.of_columns(columns),
             snr=self.snr[columns],
-            metrics=self.metrics[columns],
+            llr=self.llr[columns],
             joint=self.joint[columns],
-            free_log_evidence=None if self.free_log_evidence is None else self.free_log_evidence[columns],
         )
 
     def scene_of(self, samples: SlotSamples, model: channel.ObservationModel) -> denoise.DenoiserInput:
         """Samples of all columns with their current decisions."""
         lit = self.clock.on_grid(self.posteriors.lit)
-        return denoise.DenoiserInput(samples, self.clock, lit, self.metrics, self.posteriors.w, model)
+        return denoise.DenoiserInput(samples, self.clock, lit, self.llr, self.posteriors.w, model)
 
 
 def packet_llr(reception: Reception) -> float:
@@ -134,7 +124,7 @@ def packet_llr(reception: Reception) -> float:
     Copies that differ and words outside the codebook count against packets, as missing headers do.
     """
     # The likelihoods are too sure, so a dark column or one that fits poorly must not count against packets.
-    return float(np.logaddexp(reception.column_llr, 0.0).sum())
+    return float(np.logaddexp(reception.posteriors.log_evidence, 0.0).sum())
 
 
 def headerless(reception: Reception) -> NDArray[np.bool_]:
@@ -143,10 +133,10 @@ def headerless(reception: Reception) -> NDArray[np.bool_]:
     Few rows per slot and the screen's edge violate the light model, which affects headers first. No column has packets
     if the light is a periodic waveform.
     """
-    out = assemble.find_headerless(reception.posteriors.header_llr)
+    out = assemble.find_headerless(reception.header_llr)
     if not out.all() and shows_steady_light(reception):
         return np.ones_like(out)
-    return np.asarray(out & (reception.column_llr < SETTINGS.min_headerless_llr))
+    return np.asarray(out & (reception.posteriors.log_evidence < SETTINGS.min_headerless_llr))
 
 
 def shows_steady_light(reception: Reception) -> bool:

@@ -10,8 +10,6 @@ class PassSettings(msgspec.Struct, frozen=True):
     #: 10, with packets at least 74 in 120 hard pictures.
     min_packets_llr: float = 20.0
 
-    #: Log-likelihood below the best weight at which a weight is dropped.
-    weight_margin: float = 20.0
     #: Log-likelihood ratio from which a column has packets even without a header: of 16 packets more than at 100 in 350
     #: stills all were right. Wrong clocks, which show none in any column, reach 74.
     min_headerless_llr: float = 60.0

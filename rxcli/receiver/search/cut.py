@@ -9,8 +9,8 @@ import numpy as np
 
 from rxcli.numerics import peak_offset
 from rxcli.profiles import ScreenProfile
-from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
-from rxcli.receiver import channel
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
+from rxcli.receiver.channel import llr_of
 from rxcli.receiver.decode import detect
 from rxcli.receiver.frame.acquisition import Acquisition, distinct_screens
 from rxcli.receiver.frame.context import FrameContext
@@ -22,9 +22,9 @@ from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.cameras import UNKNOWN, cameras_by_slots, estimated_camera, relabelled_camera, settle_slots
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.receiver.still import decode, detected_on, initial_pass, llr_of, slots_of_any_kind
+from rxcli.receiver.still import decode, detected, detected_on, initial_pass, slots_of_any_kind
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import Clock, Float32Array, FloatArray, FrameSoftBits
+from rxcli.types import Clock, Float32Array, FrameSoftBits
 
 #: Passes made over cut packets: all columns with light.
 _SKIP = frozenset({"dark_columns"})
@@ -212,21 +212,17 @@ def _candidates(slots: _Slots) -> Iterator[_Candidate]:
         clock = replace(clock, exposure_slots=camera.exposure_s * screen.slot_rate_hz)
         acquisition = replace(slots.acquisition, screen=screen, variants=(screen,), clock=clock)
         initial = initial_pass(acquisition)
-        of_slots = channel.metrics_of(llr_of(slots.lit), initial.model.exposure.isi_memory)
-        initial = replace(initial, metrics=(initial.metrics + of_slots) / 2)
-
-        weights = [np.full(len(initial.metrics), w / SLOTS_PER_SYMBOL) for w in WEIGHTS]
-        free = np.log(len(WEIGHTS)) + [detect.free_log_evidence(initial.metrics, w) for w in weights]
+        initial = replace(initial, llr=(initial.llr + llr_of(slots.lit)) * np.float32(0.5))
         for phase in range(SLOTS_PER_SYMBOL):
             first_slots = range(phase, n, SLOTS_PER_SYMBOL)
             # A header is in view, at least in part; the last slot of the clock lies beyond the picture.
             shown = [slot for slot in first_slots if slot < PREAMBLE_SLOTS or slot + clock.n_slots > n + 1]
             shown.sort(key=lambda first_slot: -_header_fit(initial, first_slot, n))
-            starts = [(slot, _fit(initial, free, slot, n) - SETTINGS.cut_start) for slot in shown[:2]]
+            starts = [(slot, _fit(initial, slot, n) - SETTINGS.cut_start) for slot in shown[:2]]
             if len(shown) < len(first_slots):
                 # Packets of any length: longer by a symbol than what is in view, as the first may begin before it.
                 longer = clock.packet_slots + SLOTS_PER_SYMBOL
-                starts.append((PREAMBLE_SLOTS + phase, _fit(initial, free, PREAMBLE_SLOTS + phase, longer)))
+                starts.append((PREAMBLE_SLOTS + phase, _fit(initial, PREAMBLE_SLOTS + phase, longer)))
             for first_slot, fit in starts:
                 moved = replace(acquisition, clock=_started(clock, first_slot, n))
                 yield _Candidate(context, moved, fit, is_open=first_slot not in shown)
@@ -234,22 +230,13 @@ def _candidates(slots: _Slots) -> Iterator[_Candidate]:
 
 def _header_fit(initial: Reception, first_slot: int, packet_slots: int) -> float:
     """How well the header fits where packets of some length begin elsewhere."""
-    bursts = channel.by_burst(initial.metrics, _started(initial.clock, first_slot, packet_slots))
+    bursts = _started(initial.clock, first_slot, packet_slots).by_burst(initial.llr)
     return float(np.maximum(detect.header_llr(bursts).sum(axis=0), -SETTINGS.cut_start).sum())
 
 
-def _fit(initial: Reception, free: FloatArray, first_slot: int, packet_slots: int) -> float:
-    """See `evidence.fit`: with packets of some length that begin elsewhere.
-
-    Args:
-        initial: the initial pass.
-        free: (9, C) log evidence of arbitrary slots by the weight of a column.
-        first_slot: slot of a packet that the clock begins with.
-        packet_slots: length of the packets.
-    """
-    begun = detected_on(initial, _started(initial.clock, first_slot, packet_slots))
-    own = np.take_along_axis(free, begun.posteriors.w[None] - 1, axis=0)[0]
-    return evidence.fit(replace(begun, free_log_evidence=own))
+def _fit(initial: Reception, first_slot: int, packet_slots: int) -> float:
+    """See `evidence.fit`: with packets of some length, in which the clock begins with slot `first_slot`."""
+    return evidence.fit(detected_on(initial, _started(initial.clock, first_slot, packet_slots)))
 
 
 def _started(clock: Clock, first_slot: int, packet_slots: int) -> Clock:
@@ -294,6 +281,5 @@ def _n_certain(initial: Reception) -> float:
 
 def _of_common_weights(initial: Reception) -> Reception:
     """The initial pass with the weights that columns have in common."""
-    bursts = channel.by_burst(initial.metrics, initial.clock)
-    weights = detect.common_weights(detect.detect(bursts).w_log_prob)
-    return replace(initial, posteriors=detect.detect(bursts, weights))
+    weights = detect.common_weights(initial.posteriors.w_log_prob)
+    return replace(initial, posteriors=detected(initial.llr, initial.clock, weights))

@@ -16,14 +16,14 @@ def log_evidence(reception: Reception) -> float:
 
     A dark or poorly fitting column contributes nothing. In weak light, headers are detected before symbols are.
     """
-    llr = reception.column_llr
-    headers = max(float(reception.posteriors.header_llr.sum()), 0.0)
+    llr = reception.posteriors.log_evidence
+    headers = max(float(reception.header_llr.sum()), 0.0)
     return USUAL_COLUMNS / llr.size * (float(np.logaddexp(llr, 0.0).sum()) + SETTINGS.header_weight * headers)
 
 
 def fit(reception: Reception) -> float:
     """How well packets fit, for clocks whose slots are the same: in poor light all columns together show the start."""
-    llr = reception.column_llr
+    llr = reception.posteriors.log_evidence
     return USUAL_COLUMNS / llr.size * float(np.maximum(llr, -SETTINGS.cut_start).sum())
 
 
@@ -54,6 +54,6 @@ def distinct_share(reception: Reception) -> float:
     slots = reception.payload_lit
     slots = slots - slots.mean(axis=1, keepdims=True)
     slots /= np.linalg.norm(slots, axis=1, keepdims=True) + TINY
-    own = np.logaddexp(reception.column_llr, 0.0)
+    own = np.logaddexp(reception.posteriors.log_evidence, 0.0)
     repeated = float(own[1:] @ (slots[1:] * slots[:-1]).sum(axis=1))
     return 1 - max(repeated / (float(own.sum()) + TINY), 0.0)

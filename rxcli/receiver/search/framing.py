@@ -12,17 +12,15 @@ import numpy as np
 
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL
-from rxcli.receiver import channel
 from rxcli.receiver.decode import detect
 from rxcli.receiver.decode.settings import SETTINGS as DECODE
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception
-from rxcli.receiver.light import slot_llr
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.cameras import settle
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.receiver.still import detected
+from rxcli.receiver.still import detected_on
 from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.types import Clock, FloatArray
@@ -68,8 +66,8 @@ def framing_of(
         screens: all screens that the camera may have seen.
         context: the frame, whose stated exposure speaks for screens of one slot rate if the camera is an estimate.
     """
-    own, llr = reception.clock, slot_llr(reception.metrics)
-    by_copy = detect.header_llr(channel.by_burst(reception.metrics, own.by_copy))
+    own, llr = reception.clock, reception.llr
+    by_copy = detect.header_llr(own.by_copy.by_burst(llr))
     headers = np.clip(by_copy, -DECODE.max_llr, DECODE.max_llr).sum(axis=1)
     header = int(headers.argmax()) * own.packet_slots - own.first_slot
     lengths = {own.packet_slots: acquisition.repeats}
@@ -144,6 +142,5 @@ def _exposure_log_likelihood(
 
 def _log_weight(reception: Reception, clock: Clock) -> float:
     """Log-likelihood of the length of packets and its prior."""
-    posteriors = detected(reception.metrics, clock)
-    framed = replace(reception, clock=clock, posteriors=posteriors, free_log_evidence=None)
+    framed = detected_on(replace(reception, is_long=False), clock)
     return SETTINGS.temper * evidence.log_evidence(framed) - float(np.log(clock.packet_slots))

@@ -32,7 +32,7 @@ def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Pr
     """
     own, n_columns = best.hypothesis.outline, best.hypothesis.screen.columns
     acquisition = replace(best.acquisition, clock=best.reception.clock)
-    own_llr, out = np.maximum(best.reception.column_llr, 0.0), list(outlines)
+    own_llr, out = np.maximum(best.reception.posteriors.log_evidence, 0.0), list(outlines)
     shifts = [_columns_between(own, rival, n_columns) if rival.family == own.family else 0 for rival in outlines]
     for side in (-1, 1):
         rivals = [index for index, shift in enumerate(shifts) if shift * side > 0]
@@ -95,4 +95,4 @@ def _outer_evidence(acquisition: Acquisition, n: int) -> float:
     read = slice(0, n + _BESIDE) if n > 0 else slice(n - _BESIDE, None)
     reception = initial_pass(acquisition.of_columns(read))
     outer = np.arange(n) if n > 0 else _BESIDE + np.arange(-n)
-    return float(np.maximum(reception.column_llr[outer], 0.0).sum())
+    return float(np.maximum(reception.posteriors.log_evidence[outer], 0.0).sum())

@@ -84,12 +84,12 @@ def light_without_data(context: FrameContext, reception: Reception) -> Failure |
         headers, q = PREAMBLE_SLOTS / reception.clock.packet_slots, reception.samples.samples_per_slot
         if not is_common_light(*reception.contrast, headers, SETTINGS.max_column_shift_slots * q):
             return None
-        lit = reception.column_llr[~dark_columns(reception.snr)]
+        lit = reception.posteriors.log_evidence[~dark_columns(reception.snr)]
         if lit.size and float(np.median(lit)) > PASSES.min_packets_llr:
             return None
         joint = as_one_column(reception)
         no_header = bool(np.any(assemble.find_headerless(joint.posteriors.header_llr)))
-        if float(joint.column_llr.max()) > PASSES.min_packets_llr and not no_header:
+        if float(joint.posteriors.log_evidence.max()) > PASSES.min_packets_llr and not no_header:
             return None
         return Failure(Remark("steady_light" if shows_steady_light(reception) else "one_lamp"))
 

@@ -9,7 +9,7 @@ class SearchSettings(msgspec.Struct, frozen=True):
     #: Weight of evidence in the score, because errors of samples are correlated.
     temper: float = 0.08
     #: Weight of headers without symbols relative to packets.
-    header_weight: float = 0.1
+    header_weight: float = 0.18
     #: Evidence that a complete packet adds.
     complete_packet: float = 60.0
     #: Above this evidence nothing further is proposed under a known camera: wrong clocks reach 391.

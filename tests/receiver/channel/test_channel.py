@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from made_stages import clock_of
 from numpy.typing import NDArray
-from row_profiles import Link, Shot, random_link, row_profiles, sigma_of, slot_odds
+from row_profiles import Link, Shot, random_link, row_profiles, sigma_of
 
 from rxcli.protocol import slot_patterns
 from rxcli.receiver import channel
-from rxcli.receiver.channel.patterns import by_pattern
+from rxcli.receiver.channel.patterns import by_pattern, slot_llr
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma
 from rxcli.receiver.sync import clock as sync
@@ -150,9 +150,8 @@ def test_clean_slots_have_the_right_sign(kind: str, is_initial: bool) -> None:
         lit = true_slots(link, shot_gain, now.n_slots)
         idea = np.abs(lit - np.float32(0.1))
         found = channel.slot_likelihoods(samples, now, model, idea, np.arange(6), is_initial=is_initial)
-        llr = slot_odds(found.metrics, model.exposure.isi_memory)
         inner = slice(3, now.n_slots - 3)
-        right.append(((llr > 0) == (lit > 0.5))[:, inner].ravel())
+        right.append(((found.llr > 0) == (lit > 0.5))[:, inner].ravel())
     assert np.concatenate(right).mean() > (0.999 if shot_gain.crosstalk == 0 else 0.995)
 
 
@@ -188,8 +187,8 @@ def test_brightness_does_not_matter(factor: float) -> None:
     idea = np.abs(lit - np.float32(0.1))
     brighter = replace(samples, light=samples.light * np.float32(factor))
     scaled = brightened(model, factor)
-    one = slot_odds(channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).metrics, 1)
-    other = slot_odds(channel.slot_likelihoods(brighter, now, scaled, idea, np.arange(6)).metrics, 1)
+    one = channel.slot_likelihoods(samples, now, model, idea, np.arange(6)).llr
+    other = channel.slot_likelihoods(brighter, now, scaled, idea, np.arange(6)).llr
     np.testing.assert_allclose(other, one, rtol=0.05, atol=0.3)
 
 
@@ -200,9 +199,8 @@ def test_columns_asked_for_are_those_of_the_whole() -> None:
     whole = channel.slot_likelihoods(samples, now, model, lit, np.arange(6))
     two = SlotSamples(samples.light[[1, 4]], samples.valid[[1, 4]], samples.samples_per_slot)
     some = channel.slot_likelihoods(two, now, model, lit, np.array([1, 4]))
-    np.testing.assert_allclose(some.metrics, whole.metrics[[1, 4]], rtol=1e-5, atol=1e-4)
-    assert whole.metrics.shape == (6, now.n_slots + model.exposure.isi_memory, 2 << model.exposure.isi_memory)
-    assert whole.snr.shape == (6, now.n_slots)
+    np.testing.assert_allclose(some.llr, whole.llr[[1, 4]], rtol=1e-4, atol=1e-4)
+    assert whole.llr.shape == whole.snr.shape == (6, now.n_slots)
 
 
 def hostile(kind: str, samples: SlotSamples) -> SlotSamples:
@@ -239,12 +237,12 @@ def test_hostile_light_gives_finite_likelihoods(kind: str, is_initial: bool, ide
     model = model_for(Shot(), sigma, black_level)
     lit = np.full((6, now.n_slots), idea, np.float32)
     contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)
-    first = channel.initial_metrics(*contrast, model.exposure)
+    first = channel.initial_llr(*contrast, model.exposure)
     found = channel.slot_likelihoods(samples, now, model, lit, np.arange(6), is_initial=is_initial)
-    for values in (first, found.metrics, found.snr, found.timing):
+    for values in (first, found.llr, found.snr, found.timing):
         assert np.isfinite(values).all()
     if kind == "nothing seen":
-        assert (found.metrics == 0).all()
+        assert (found.llr == 0).all()
         assert (found.snr == 0).all()
 
 
@@ -281,21 +279,44 @@ def test_a_slot_says_nothing_of_its_own_picture(q: int) -> None:
     assert not np.array_equal(before[..., slot + 1], after[..., slot + 1])
 
 
-@pytest.mark.parametrize("isi_memory", [1, 3])
-def test_metrics_of_copies_are_added(isi_memory: int) -> None:
+def test_slots_of_copies_are_added() -> None:
     """Four copies of seventy slots, the first from its slot 33 on; the last is another burst."""
     now = Clock(5.0, 1.0, 70, 0.0, 180, 33, np.array([0, 0, 0, 1]), np.zeros(2), 9.0)
-    rng = np.random.default_rng(0)
-    metrics = rng.normal(0, 1, (2, 180 + isi_memory, 2 << isi_memory))
-    found = channel.by_burst(metrics, now)
-    assert found.shape == (2, 2, 70 + isi_memory, 2 << isi_memory)
+    llr = np.random.default_rng(0).normal(0, 1, (2, 180))
+    found = now.by_burst(llr)
+    assert found.shape == (2, 2, 70)
     at = 50  # seen in copies 0, 1 and 2, on grid slots 17, 87 and 157
-    np.testing.assert_allclose(found[0, :, at], metrics[:, 17] + metrics[:, 87] + metrics[:, 157])
+    np.testing.assert_allclose(found[0, :, at], llr[:, 17] + llr[:, 87] + llr[:, 157])
     early = 20  # not seen in copy 0
-    np.testing.assert_allclose(found[0, :, early], metrics[:, 57] + metrics[:, 127])
-    # The header after a copy tells of the copy's last slots: its first metrics are added at the end.
-    np.testing.assert_allclose(found[0, :, 70], metrics[:, 37] + metrics[:, 107] + metrics[:, 177])
-    assert (found[:, :, :isi_memory] == 0).all()
+    np.testing.assert_allclose(found[0, :, early], llr[:, 57] + llr[:, 127])
+    np.testing.assert_allclose(found[1, :, :3], llr[:, 177:])
+    assert (found[1, :, 3:] == 0).all()  # beyond the grid
+
+
+@pytest.mark.parametrize("isi_memory", [1, 3])
+def test_slots_that_are_independent_keep_their_ratio(isi_memory: int) -> None:
+    llr = np.random.default_rng(1).normal(0, 3, (2, 50)).astype(np.float32)
+    by_slot = np.pad(llr, ((0, 0), (0, isi_memory)))[..., None] * slot_patterns(isi_memory)[:, -1]
+    np.testing.assert_allclose(slot_llr(by_slot.astype(np.float32)), llr, atol=1e-4)
+
+
+@pytest.mark.parametrize("isi_memory", [1, 3])
+def test_a_slot_between_known_ones_by_brute_force(isi_memory: int) -> None:
+    """Where all others are plain by their own light, the ratio of one is a difference of metrics."""
+    rng, n, slot = np.random.default_rng(isi_memory), 13, 6
+    metrics, slots = rng.normal(0, 1, (1, n + isi_memory, 2 << isi_memory)), rng.integers(0, 2, n)
+    plain = 30.0 * (2 * slots - 1) * (np.arange(n) != slot)
+    metrics[0, :n] += plain[:, None] * slot_patterns(isi_memory)[:, -1]
+
+    def total(states: NDArray[np.int64]) -> float:
+        padded = np.pad(states, isi_memory)
+        index = [int("".join(map(str, padded[i : i + isi_memory + 1])), 2) for i in range(n + isi_memory)]
+        return float(metrics[0, np.arange(n + isi_memory), index].sum())
+
+    lit_there, dark_there = (np.where(np.arange(n) == slot, state, slots) for state in (1, 0))
+    found = slot_llr(metrics.astype(np.float32))[0]
+    assert found[slot] == pytest.approx(total(lit_there) - total(dark_there), abs=0.02)
+    assert (np.sign(found) == np.sign(plain))[np.arange(n) != slot].all()
 
 
 @pytest.mark.parametrize("tails", [0.0, 0.4])

@@ -18,7 +18,7 @@ from rxcli.lab.training.dataset import UNKNOWN, Sample, validation_sample
 from rxcli.lab.training.scenes import SCENE_CLASSES, validation_scene
 from rxcli.protocol import HEADER, bits_per_symbol, codebook, encode_packet
 from rxcli.receiver import channel, still
-from rxcli.receiver.channel import denoise, metrics_of
+from rxcli.receiver.channel import denoise
 from rxcli.receiver.channel.denoise import COLUMN_FEATURES, STRIP_FEATURES, DenoiserInput, load_denoiser, network_inputs
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Failure
@@ -65,7 +65,7 @@ def scene_of(slots: np.ndarray, rng: np.random.Generator, *, noise: float = 0.00
         samples=SlotSamples(light.astype(np.float32), np.ones(light.shape, np.float32), Q),
         clock=clock,
         lit=slots.astype(np.float32),
-        metrics=metrics_of(9.0 * (2.0 * slots - 1), 1),
+        llr=(9.0 * (2.0 * slots - 1)).astype(np.float32),
         w=np.full(len(slots), W),
         model=channel.ObservationModel(
             0.01, NoiseModel(noise**2, 1e-6), Crosstalk(crosstalk), Exposure.of(EXPOSURE, Q)
@@ -209,7 +209,7 @@ def test_shipped_models_contradict_wrong_beliefs(name: str) -> None:
     wrong = rng.random(scene.lit.shape) < 0.04
     wrong[:, np.arange(2 * PACKET) % PACKET < 20] = False
     lit = np.where(wrong, 1 - scene.lit, scene.lit).astype(np.float32)
-    doubted = replace(scene, lit=lit, metrics=metrics_of(2.0 * (2 * lit - 1), 1))
+    doubted = replace(scene, lit=lit, llr=2.0 * (2 * lit - 1))
     towards = load_denoiser(name).slot_corrections(doubted, np.arange(N_COLUMNS)) * (2 * scene.lit - 1)
     assert (towards[wrong] > 0).mean() > 0.8
     assert towards[wrong].mean() > towards[~wrong].mean() + 0.5

@@ -135,7 +135,9 @@ def test_outlines_are_read_as_screens_of_their_columns() -> None:
 @pytest.mark.parametrize(("repeats", "share"), [(1, 1.0), (2, 0.5), (5, 0.2)])
 def test_columns_that_repeat_their_neighbour_say_nothing_more(repeats: int, share: float) -> None:
     lit = np.random.default_rng(repeats).random((100 // repeats, 500)).repeat(repeats, axis=0) > 0.5
-    reception: Any = SimpleNamespace(payload_lit=lit.astype(np.float32), column_llr=np.full(100, 50.0))
+    reception: Any = SimpleNamespace(
+        payload_lit=lit.astype(np.float32), posteriors=SimpleNamespace(log_evidence=np.full(100, 50.0))
+    )
     assert distinct_share(reception) == pytest.approx(share, abs=0.02)
 
 

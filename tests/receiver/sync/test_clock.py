@@ -13,7 +13,7 @@ from rxcli.protocol import encode_packet
 from rxcli.receiver import channel
 from rxcli.receiver.decode import detect
 from rxcli.receiver.frame.acquisition import noise_of
-from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma, slot_llr
+from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import BurstPosteriors, Clock, RowProfiles, SlotSamples
 
@@ -48,16 +48,16 @@ def received(
         exposure=Exposure.of(shot.exposure_slots, Q),
     )
     contrast = sync.contrast(samples.light, samples.valid, Q, model.noise.sigma)
-    metrics = channel.initial_metrics(*contrast, model.exposure)
-    clock_ = sync.possible_bursts(clock_, slot_llr(metrics), (REPEATS,))[0][0]
+    llr = channel.initial_llr(*contrast, model.exposure)
+    clock_ = sync.possible_bursts(clock_, llr, (REPEATS,))[0][0]
     for _ in range(rounds):
-        posteriors = detect.detect(channel.by_burst(metrics, clock_))
+        posteriors = detect.detect(clock_.by_burst(llr))
         lit = clock_.on_grid(posteriors.lit)
         found = channel.slot_likelihoods(samples, clock_, model, lit, np.arange(lit.shape[0]), is_initial=True)
-        metrics = found.metrics
-        clock_ = sync.corrected(sync.possible_bursts(clock_, slot_llr(metrics), (REPEATS,))[0][0], found.timing)
+        llr = found.llr
+        clock_ = sync.corrected(sync.possible_bursts(clock_, llr, (REPEATS,))[0][0], found.timing)
         samples = sync.sample_slots(profiles, clock_, Q)
-    posteriors = detect.detect(channel.by_burst(metrics, clock_))
+    posteriors = detect.detect(clock_.by_burst(llr))
     return clock_, posteriors, samples
 
 

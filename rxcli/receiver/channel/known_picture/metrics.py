@@ -1,4 +1,4 @@
-"""Log-likelihood of the light for every slot pattern."""
+"""Log-likelihood ratio of every slot."""
 
 from functools import cache
 
@@ -8,11 +8,12 @@ from rxcli.protocol import slot_patterns
 from rxcli.receiver.channel.known_picture.exposure import ExpectedLight, SlotView
 from rxcli.receiver.channel.known_picture.picture import ColumnLight
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods
-from rxcli.types import Clock, Float32Array, FloatArray, IntArray
+from rxcli.receiver.channel.patterns import slot_llr
+from rxcli.types import Clock, Float32Array, IntArray
 
 
 def slot_likelihoods(observed: ColumnLight, expected: ExpectedLight, clock: Clock, isi_memory: int) -> SlotLikelihoods:
-    """Log-likelihood of every slot pattern at every slot, the counterpart of `channel.slot_likelihoods`.
+    """Log-likelihood ratio of every slot, the counterpart of `channel.slot_likelihoods`.
 
     Args:
         observed: the columns' light.
@@ -28,17 +29,17 @@ def slot_likelihoods(observed: ColumnLight, expected: ExpectedLight, clock: Cloc
     # Squared contrast over variance of a slot is the precision of the rows around; a row of every slot shows it.
     some = observed.precision[:, :: max(int(clock.rows_per_slot), 1)]
     snr = np.median(some, axis=1, keepdims=True) * np.float32(clock.rows_per_slot)
-    return SlotLikelihoods(np.concatenate(parts), snr)
+    return SlotLikelihoods(slot_llr(np.concatenate(parts)), snr)
 
 
 def _row_metrics(
     weighted: Float32Array, precision: Float32Array, view: SlotView, n_slots: int, isi_memory: int
-) -> FloatArray:
+) -> Float32Array:
     """Metrics of columns with equal delay; `weighted` (C, R) is their light times its precision."""
     borders = np.searchsorted(view.metric, np.arange(n_slots + isi_memory + 1))
     sums, basis = _slot_sums(weighted, precision, view.share[1:-1], borders), _pattern_basis(isi_memory)
     metrics = sums.reshape(len(basis), -1).T @ basis
-    return metrics.reshape(*sums.shape[1:], -1).astype(np.float64)
+    return metrics.reshape(*sums.shape[1:], -1)
 
 
 def _slot_sums(weighted: Float32Array, precision: Float32Array, share: Float32Array, borders: IntArray) -> Float32Array:
