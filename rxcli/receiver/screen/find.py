@@ -36,7 +36,7 @@ _REACH_GAIN = 1.4
 _FIRST_STEPS, _LAST_STEPS, _COURSES = 3, 2, 2
 #: Contrast of the strongest comb, as a share of the light it explains, from which no further combs are tried; number of
 #: combs that are fitted otherwise.
-_PLAIN_CONTRAST, _N_FITTED = 0.22, 3
+_PLAIN_CONTRAST, _N_FITTED = 0.22, 2
 #: Weights of the light that a grid explains and of its perspective in its score, against 1 for its contrast: fitted to
 #: the grids of 186 simulated scenes, one in four of a night, such that no bright one loses its own.
 _BY_EXPLAINED, _BY_PERSPECTIVE = 7.0, -1.0
@@ -48,9 +48,6 @@ _OF_PART = 0.4
 _ONE_SCREEN = 0.9
 #: Contrast, times what chance gives, from which packets are looked for; of a part of a picture it must be plainer.
 _POSSIBLE_CONTRAST = 0.5
-#: Score below the best grid's down to which a second one is proposed, and its log-odds: it is right in one picture of
-#: ten; mean distance from which grids differ, columns.
-_NEARLY_BEST, _SECOND, _DIFFERENT = 0.3, -25.0, 0.2
 #: Log-odds relative to the likeliest first column down to which another one is possible.
 _MIN_LOG_ODDS = -7.0
 #: Number of unlit columns at a side from which the side counts as not visible.
@@ -109,9 +106,8 @@ def find_screens(
     def along(course: Course) -> PictureStrips:
         return read_strips(plane, lens, course=course)
 
-    placed = wide_grids(strips, wide[0].sigma, rivals, _POSSIBLE_CONTRAST, along)
-    found = [candidate for rank, own in enumerate(placed) for candidate in _numbered(*own, wide, parts, rank)]
-    return [sorted(found, key=lambda candidate: -candidate.log_odds)] if found else []
+    placed = wide_grid(strips, wide[0].sigma, rivals, _POSSIBLE_CONTRAST, along)
+    return [_numbered(*placed, wide, parts)] if placed else []
 
 
 def shows_narrow(plane: LightPlane) -> bool:
@@ -141,13 +137,12 @@ def _screens_apart(strips: PictureStrips, layouts: Sequence[ColumnLayout]) -> li
         return float(np.ptp(_light_across(part, grid, layouts[0].sigma)[1].ends))
 
     sides, too_many = strips.sides_of_gap(), max(layout.n_columns for layout in layouts) + 1
-    found = [own for side in sides for own in wide_grids(side, layouts[0].sigma)[:1]]
+    found = [own for side in sides if (own := wide_grid(side, layouts[0].sigma))]
     if len(found) < 2 or sum(n_lit(side, grid) for side, grid in found) < too_many:
         return []
-    together = sum(grid.contrast for _, grid in found)
-    for _, grid in wide_grids(strips, layouts[0].sigma)[:1]:
-        if grid.contrast > _ONE_SCREEN * together and n_lit(strips, grid) < too_many:
-            return []
+    together, whole = sum(grid.contrast for _, grid in found), wide_grid(strips, layouts[0].sigma)
+    if whole and whole[1].contrast > _ONE_SCREEN * together and n_lit(*whole) < too_many:
+        return []
     clearest_first = sorted(found, key=lambda side_and_grid: -side_and_grid[1].explained)
     return [_numbered(side, grid, layouts) for side, grid in clearest_first]
 
@@ -181,14 +176,14 @@ def thinned(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white:
     return np.asarray((pixels[*steps] - np.float32(black)) / (white - black), np.float32)
 
 
-def wide_grids(
+def wide_grid(
     strips: PictureStrips,
     sigma: float,
     rivals: Sequence[Grid] = (),
     least: float = 1.0,
     along: Callable[[Course], PictureStrips] | None = None,
-) -> list[_Placed]:
-    """The grid of wide columns that explains the strips' light best, and one that does nearly as well, if any.
+) -> _Placed | None:
+    """The grid of wide columns with the best score, if its borders stand out.
 
     Args:
         strips: of the picture, upright.
@@ -211,21 +206,8 @@ def wide_grids(
     ahead = [_OF_PART * any(grid is rival for rival in rivals) for _, grid in starts]
     placed = [_fitted(own, grid, sigma, along) for own, grid in starts]
     scored = [(_score(own[1]) + more, own) for own, more in zip(placed, ahead, strict=True)]
-    scored = sorted((own for own in scored if _stands_out(*own[1], least)), key=lambda own: -own[0])
-    if not scored:
-        return []
-    score, likeliest = scored[0]
-    # Of grids with the same columns the likeliest is nearest to them.
-    best = max((own for _, own in scored if not _differ(own, likeliest)), key=lambda own: _likelihood(own[1]))
-    # About one course of columns that lean the nearly likeliest is the likeliest, not yet in its place.
-    second = [
-        rival
-        for own, rival in scored
-        if own >= score - _NEARLY_BEST
-        and _differ(rival, likeliest)
-        and UPRIGHT in (rival[0].course, likeliest[0].course)
-    ]
-    return [best, *second[:1]]
+    scored = [own for own in scored if _stands_out(*own[1], least)]
+    return max(scored, key=lambda own: own[0])[1] if scored else None
 
 
 def _starts(strips: PictureStrips, quiet: PictureStrips, sigma: float) -> list[_Placed]:
@@ -235,7 +217,7 @@ def _starts(strips: PictureStrips, quiet: PictureStrips, sigma: float) -> list[_
     if not starts or starts[0].contrast < _PLAIN_CONTRAST * starts[0].explained:
         starts += [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
         # Contrast needs borders that are in their place already.
-        starts = sorted(starts, key=_likelihood, reverse=True)[:_N_FITTED]
+        starts = sorted(starts, key=lambda grid: -grid.explained - grid.contrast)[:_N_FITTED]
     return [(strips, grid) for grid in starts]
 
 
@@ -267,11 +249,6 @@ def _fitted(
     return strips, with_light(strips, moved_by_waveforms(strips, grid, sigma, _LAST_STEPS), sigma)
 
 
-def _likelihood(grid: Grid) -> float:
-    """Log-likelihood of a grid with its borders in their place."""
-    return grid.explained + grid.contrast
-
-
 def _score(grid: Grid) -> float:
     """Score by which grids are compared, a tenth of the log-odds.
 
@@ -282,13 +259,6 @@ def _score(grid: Grid) -> float:
         return -np.inf
     perspective = _BY_PERSPECTIVE * float(np.square(grid.coefficients[3:5]).sum())
     return float(np.log(grid.contrast) + _BY_EXPLAINED * np.log(grid.explained)) + max(perspective, _FROM_THE_SIDE)
-
-
-def _differ(placed: _Placed, rival: _Placed) -> bool:
-    """Whether two grids differ in more than the number of the first column."""
-    strips, grid = placed
-    off = columns_at(grid.coefficients, strips.x, strips.y) - columns_at(rival[1].coefficients, strips.x, strips.y)
-    return bool(np.abs(off - np.round(np.median(off))).mean() > _DIFFERENT)
 
 
 def narrow_grid(strips: PictureStrips, sigma: float) -> Grid | None:
@@ -324,14 +294,14 @@ def _stands_out(strips: PictureStrips, grid: Grid, least: float = 1.0) -> bool:
 
 
 def _numbered(
-    strips: PictureStrips, grid: Grid, layouts: Sequence[ColumnLayout], parts: Sequence[FloatArray] = (), rank: int = 0
+    strips: PictureStrips, grid: Grid, layouts: Sequence[ColumnLayout], parts: Sequence[FloatArray] = ()
 ) -> list[Outline]:
     """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
     grid, certainty = _across_gap(strips, grid, layouts[0], parts)
     light, profile = _light_across(strips, grid, layouts[0].sigma, parts)
     stands_out = _stands_out(strips, grid)
     found: list[Outline] = []
-    for family, layout in enumerate(layouts, rank * len(layouts)):
+    for family, layout in enumerate(layouts):
         columns, odds, fills = first_columns(profile, layout.n_columns)
         best, n = int(columns[odds.argmax()]), layout.n_columns
         own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, _LAST_STEPS, n_columns=n)
@@ -356,7 +326,7 @@ def _numbered(
                     )
                 )
     likeliest = max(candidate.log_odds for candidate in found)
-    found = [replace(candidate, log_odds=candidate.log_odds - likeliest + rank * _SECOND) for candidate in found]
+    found = [replace(candidate, log_odds=candidate.log_odds - likeliest) for candidate in found]
     return sorted(found, key=lambda candidate: -candidate.log_odds)
 
 

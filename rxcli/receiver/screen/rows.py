@@ -21,10 +21,8 @@ _BINS, _BEYOND = 640, 0.6
 _LIT_SHARE = 0.18
 #: Share of missing height below which the light is taken for the whole screen; share of the light that is nearly all.
 _WHOLE, _NEARLY_ALL = 0.07, 0.98
-#: Rows on either side of an end of the screen whose light is compared, screen heights.
-_EDGE = 0.02
-#: Focal length of a camera that no profile describes, picture widths; share by which it may be another.
-_FOCAL_WIDTHS, _FOCAL_RANGE = 0.8, 0.3
+#: Focal length of a camera that no profile describes, picture widths.
+_FOCAL_WIDTHS = 0.8
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +43,7 @@ class ScreenAxis:
         the columns is at right angles to both.
         """
         u0, a, b, g, h, _ = grid.coefficients
-        focal = _focal_widths(grid)
+        focal = _FOCAL_WIDTHS if grid.lens is None else float(grid.lens.camera_matrix[0, 0] / grid.width)
         depth = np.array([g * focal, h * focal, 1.0])
         normal = depth / np.linalg.norm(depth)
         across = np.array([(u0 * g + a) * focal, (u0 * h + b) * focal, u0])
@@ -103,31 +101,7 @@ def find_rows(
     if missing > _WHOLE:
         return axis, (top - missing / 2, bottom + missing / 2), True
     # A slightly too large outline costs less than omitted rows.
-    reach = _height_range(grid)
-    return axis, (_edge(v, by_row, bottom - 1, reach, 1), _edge(v, by_row, top + 1, reach, -1)), False
-
-
-def _focal_widths(grid: Grid) -> float:
-    """Focal length of a picture, picture widths."""
-    return _FOCAL_WIDTHS if grid.lens is None else float(grid.lens.camera_matrix[0, 0] / grid.width)
-
-
-def _height_range(grid: Grid) -> float:
-    """Share by which a screen seen from the side may be higher or lower: another focal length means another tilt."""
-    tangent = _focal_widths(grid) * np.hypot(*grid.coefficients[3:5])
-    return float(_FOCAL_RANGE * tangent**2 / (1 + tangent**2)) if grid.lens is None else 0.0
-
-
-def _edge(v: FloatArray, light: FloatArray, end: float, reach: float, sign: int) -> float:
-    """Where the light rises most (falls, with a sign of -1) within reach of an end of the screen."""
-    places = np.flatnonzero(np.abs(v - end) < reach)
-    if places.size == 0:
-        return end
-    n = round(_EDGE / float(v[1] - v[0]))
-    total = np.cumsum(np.pad(light, n))
-    # Of bins of `light`, `total` ends with the one `n` before.
-    rise = total[places + 2 * n - 1] - 2 * total[places + n - 1] + total[places - 1]
-    return float(v[places[(sign * rise).argmax()]])
+    return axis, (bottom - 1, top + 1), False
 
 
 def lit_range(v: FloatArray, light: FloatArray) -> tuple[float, float]:

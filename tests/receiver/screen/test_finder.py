@@ -17,7 +17,7 @@ from rxcli.receiver.screen.find import (
     ColumnLayout,
     find_screens,
     why_useless,
-    wide_grids,
+    wide_grid,
 )
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_through
 from rxcli.receiver.screen.numbering import (
@@ -312,36 +312,21 @@ def test_a_rival_replaces_missing_combs_where_borders_show(monkeypatch: pytest.M
     monkeypatch.setattr(find, "find_combs", lambda *_: [])
     strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
     x, y = strips.x, strips.y
-    ((_, reached),) = wide_grids(strips, 0.45, [true.shifted(0.2)])
+    _, reached = wide_grid(strips, 0.45, [true.shifted(0.2)])
     assert np.abs(columns_at(reached.coefficients, x, y) - columns_at(true.coefficients, x, y)).max() < 0.3
-    assert not wide_grids(strips, 0.45, [true.shifted(0.5)])
-
-
-def test_a_second_grid_is_proposed_where_it_does_nearly_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(find, "_PLAIN_CONTRAST", 1.0)
-    monkeypatch.setattr(find, "_stands_out", lambda *_: True)
-    plane, narrower = drawn("blobs"), CORNERS.mean(axis=0) + (CORNERS - CORNERS.mean(axis=0)) * np.array([0.85, 1.0])
-    for nearly, families in ((0.0, {0}), (99.0, {0, 1})):
-        monkeypatch.setattr(find, "_NEARLY_BEST", nearly)
-        (outlines,) = find_screens(plane, [WIDE], None, [narrower])
-        assert {one.family for one in outlines} == families
-        assert outlines[0].family == 0
-    second = next(one for one in outlines if one.family == 1)
-    assert second.log_odds == -25
-    off = [apart(one) - np.round(np.median(apart(one))) for one in (outlines[0], second)]
-    assert np.abs(off[0]).max() < 0.2 < np.abs(off[1]).max()
+    assert not wide_grid(strips, 0.45, [true.shifted(0.5)])
 
 
 @pytest.mark.parametrize(
-    ("share", "true_light", "light", "n_proposed"),
+    ("share", "true_light", "light"),
     [
-        pytest.param(1.2, (34090, 2948), (34473, 2634), 2, id="narrower columns explain more but stand out less"),
-        pytest.param(2.0, (50758, 16398), (54738, 575), 1, id="far too narrow ones explain more and stand out little"),
-        pytest.param(0.8, (34336, 5315), (31592, 5625), 1, id="wide ones stand out more over lamps at night"),
+        pytest.param(1.2, (34090, 2948), (34473, 2634), id="narrower columns explain more but stand out less"),
+        pytest.param(2.0, (50758, 16398), (54738, 575), id="far too narrow ones explain more and stand out little"),
+        pytest.param(0.8, (34336, 5315), (31592, 5625), id="wide ones stand out more over lamps at night"),
     ],
 )
 def test_grids_compare_by_contrast_and_by_what_they_explain(
-    monkeypatch: pytest.MonkeyPatch, share: float, true_light: FloatArray, light: FloatArray, n_proposed: int
+    monkeypatch: pytest.MonkeyPatch, share: float, true_light: FloatArray, light: FloatArray
 ) -> None:
     strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
     rivals = [replace(true, coefficients=true.coefficients * np.array([1, by, 1, 1, 1, 1])) for by in (1, share)]
@@ -355,10 +340,9 @@ def test_grids_compare_by_contrast_and_by_what_they_explain(
     monkeypatch.setattr(find, "grid_of_comb", lambda grid, _: replace(grid))
     monkeypatch.setattr(find, "moved_by_waveforms", lambda _, grid, *__: grid)
     monkeypatch.setattr(find, "with_light", lit)
-    proposed = [grid.coefficients[1] for _, grid in wide_grids(strips, 0.45)]
-    assert proposed == [grid.coefficients[1] for grid in rivals][:n_proposed]
+    assert wide_grid(strips, 0.45)[1].coefficients[1] == rivals[0].coefficients[1]
     monkeypatch.setattr(find, "find_combs", lambda *_: rivals[:1])
-    assert wide_grids(strips, 0.45, rivals[1:])[0][1].coefficients[1] == rivals[share == 1.2].coefficients[1]
+    assert wide_grid(strips, 0.45, rivals[1:])[1].coefficients[1] == rivals[share == 1.2].coefficients[1]
 
 
 def test_combs_are_fitted_by_their_likelihood_as_borders_out_of_place_stand_out_little(
@@ -375,18 +359,18 @@ def test_combs_are_fitted_by_their_likelihood_as_borders_out_of_place_stand_out_
     monkeypatch.setattr(find, "grid_of_comb", lambda comb, _: comb)
     monkeypatch.setattr(find, "moved_by_waveforms", lambda _, grid, *__: replace(grid))
     monkeypatch.setattr(find, "with_light", lit)
-    assert wide_grids(strips, 0.45)[0][1].coefficients[1] == pytest.approx(true.coefficients[1])
+    assert wide_grid(strips, 0.45)[1].coefficients[1] == pytest.approx(true.coefficients[1])
 
 
 def test_one_grid_over_a_dark_gap_is_one_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     plane, n_strips = drawn("gap"), read_strips(drawn("gap")).coherence.shape[1]
 
-    def too_narrow_at_a_side(strips: PictureStrips, *rest: Any) -> list[tuple[PictureStrips, Grid]]:
-        placed, share = wide_grids(strips, *rest), 1.0 if strips.coherence.shape[1] == n_strips else 1.5
+    def too_narrow_at_a_side(strips: PictureStrips, *rest: Any) -> tuple[PictureStrips, Grid]:
+        (own, grid), share = wide_grid(strips, *rest), 1.0 if strips.coherence.shape[1] == n_strips else 1.5
         factors = np.array([1, share, 1, 1, 1, 1])
-        return [(own, replace(grid, coefficients=grid.coefficients * factors)) for own, grid in placed]
+        return own, replace(grid, coefficients=grid.coefficients * factors)
 
-    monkeypatch.setattr(find, "wide_grids", too_narrow_at_a_side)
+    monkeypatch.setattr(find, "wide_grid", too_narrow_at_a_side)
     (outlines,) = find_screens(plane, [WIDE])
     assert np.abs(apart(outlines[0])).max() < 0.3
 
