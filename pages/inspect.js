@@ -158,9 +158,25 @@
       ? bar(x * wide_, height - ((y + 1) * height) / bins, wide_ + 0.3, height / bins + 0.3, "bar", { "fill-opacity": Math.sqrt(n / peak).toFixed(2) }) : null)).filter(Boolean));
     cells.push(label(0, height + 16, "0"), label(width / 2, height + 16, "1 slot", "middle"), label(width, height + 16, "2 slots", "end"));
     section("How clear slots are", "", make("h3", "Slot values"), svg(height + 22, told, [...marks, ...bars], width, "small"),
-      make("p", `${told} The further apart, the surer.`, "hint"), make("h3", "Eye diagram"),
+      make("p", `${told} The further apart, the surer.`, "hint"), ...driven(), make("h3", "Eye diagram"),
       svg(height + 22, "Eye diagram: how light and time within two slots meet.", cells, width, "small"),
       make("p", "All columns, folded over two slots, the picture's own brightness taken out. Open eyes between the traces mean that slots can be told apart; a long exposure closes them.", "hint"));
+  }
+
+  // How well each column is driven.
+  function driven() {
+    if (!data.quality.length) return [];
+    const micro = (value) => (value === null ? "" : (1e6 * value).toFixed(1)), part = (value) => (value === null ? "" : percent(value));
+    const shown = [["Column", (q) => q.column], ["SNR, dB", (q) => (q.snr_db === null ? "" : q.snr_db.toFixed(1))], ["Contrast", (q) => part(q.contrast)], ["Brightness", (q) => part(q.brightness)],
+      ["Lit after dark", (q) => part(q.lit_after_dark)], ["Dark after lit", (q) => part(q.dark_after_lit)], ["Rise, µs", (q) => micro(q.rise_s)], ["Fall, µs", (q) => micro(q.fall_s)], ["Jitter, µs", (q) => micro(q.jitter_s)]];
+    const grid = make("table"), head = make("tr"), rows = data.quality.map((quality) => {
+      const row = make("tr");
+      row.append(...shown.map(([, text]) => make("td", String(text(quality)), "number")));
+      return row;
+    });
+    head.append(...shown.map(([title]) => make("th", title, "number")));
+    grid.append(head, ...rows);
+    return [folded("How well each column is driven", grid)];
   }
 
   function residuals(known) {

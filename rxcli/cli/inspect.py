@@ -1,13 +1,14 @@
 """`vlc-rx inspect`: a page that shows every stage of the reception of a photo, or of a clip and one of its frames."""
 
 import re
+from dataclasses import asdict
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
 import click
 
-from rxcli.cli.common import force_argument, options, receiver_arguments, receiver_options
+from rxcli.cli.common import force_argument, json_output, options, receiver_arguments, receiver_options, write_json
 from rxcli.cli.kinds import FOLDER
 from rxcli.errors import ExitCode, InputError
 from rxcli.ingest import open_source
@@ -16,7 +17,10 @@ from rxcli.outputs import Output, claim, claim_own_folder, write_whole
 from rxcli.receiver.receive import receive
 from rxcli.results.cameras import camera_of, screen_of
 from rxcli.results.dump import plain_name
+from rxcli.results.inspection import inspect_frame
 from rxcli.results.page import MARK, inspection_page
+from rxcli.results.quality import qualities
+from rxcli.results.record import plain
 from rxcli.results.report import format_link
 from rxcli.results.truth import Scorer, load_truth, truth_for
 from rxcli.runs.batch import standard_decoder
@@ -33,9 +37,10 @@ _MAX_FRAMES = 240
     ("--frame", click.IntRange(0), None, "Frame of a clip. [default: the one with the most packets]"),
     ("--out", FOLDER, None, "Folder to write. [default: ./inspect-NAME]"),
     ("--truth=FILE|auto", str, None, "Count wrong bits against this truth."),
+    ("--json=FILE|- json_path", click.Path(allow_dash=True), None, "Write how well each column is driven as JSON."),
 )
 @force_argument
-def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, force: bool, **options: Any) -> int:
+def inspect(path: str, frame: int | None, out: Path | None, force: bool, **options: Any) -> int:
     """Write a page that shows how PATH was received, stage by stage, or why not; prints the page's path.
 
     Texts and files that came are named on stderr.
@@ -44,14 +49,15 @@ def inspect(path: str, frame: int | None, out: Path | None, truth: str | None, f
     """
     folder = out or Path(f"inspect-{plain_name(path).strip('._') or 'picture'}")
     page = folder / "index.html"
-    claim([page_output(folder)], (path,), (), force)
+    truth, json_path = options.pop("truth"), options.pop("json_path")
+    claim([page_output(folder), json_output(json_path, "frame", "quality")], (path,), (), force)
     if folder.exists():  # a new one is made when there is something to put into it
         claim_own_folder("--out", folder, (page.name,), force)
-    results = write_page(path, page, receiver_options(options, soft_bits=True), frame, truth, force)
+    results = write_page(path, page, receiver_options(options, soft_bits=True), frame, truth, force, json_path)
     for result in results:
         for line in format_link(result):
             click.echo(line, err=True)
-    click.echo(page)
+    click.echo(page, err=json_path == "-")
     received = any(result.packets or result.messages or result.objects for result in results)
     return ExitCode.OK if received else ExitCode.NOT_RECEIVED
 
@@ -68,6 +74,7 @@ def write_page(
     frame: int | None = None,
     truth: str | None = None,
     force: bool = False,
+    json_path: str | None = None,
 ) -> list[FrameResult]:
     """Receive the photo or clip at `path` and write the page that shows how; results of all its frames.
 
@@ -78,6 +85,7 @@ def write_page(
         frame: number of the frame to show; None: the one with the most packets.
         truth: file with what was sent, "auto" for the one beside `path`, None for none.
         force: write into a folder of somebody else.
+        json_path: file that takes how well each column is driven, "-" for the standard output.
 
     Raises:
         InputError: the source cannot be read, or has no such frame.
@@ -85,9 +93,12 @@ def write_page(
     results, picture, taps = _received(path, frame, options, truth)
     shown = next(result for result in results if result.frame == picture.index)
     screen, camera = screen_of(shown, options.screens), camera_of(picture, shown, options.cameras)
-    text = inspection_page(picture, shown, screen, camera, taps, results if len(results) > 1 else [])
+    known = inspect_frame(taps, shown) if taps and shown.columns else None
+    text = inspection_page(picture, shown, screen, camera, known, results if len(results) > 1 else [])
     claim_own_folder("--out", page.parent, (page.name,), force)
     write_whole(page, text)
+    quality = qualities(known, 1 / screen.slot_rate_hz) if known and screen else []
+    write_json({"source": path, "frame": shown.frame, "quality": [plain(asdict(each)) for each in quality]}, json_path)
     return results
 
 

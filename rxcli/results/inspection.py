@@ -15,9 +15,9 @@ from rxcli.receiver.sync.clock import sample_slots
 from rxcli.types import BoolArray, Clock, ColumnResult, Float32Array, FloatArray, FrameResult, RowProfiles, SlotSamples
 
 #: Samples of a slot, and slots over which one clock residual is measured.
-_PER_SLOT, _RESIDUAL_SLOTS = 10, 30
+PER_SLOT, _RESIDUAL_SLOTS = 10, 30
 #: Bins of histogram and eye diagram; times of one slot before and after.
-BINS, EYE_TIMES = 40, 2 * _PER_SLOT
+BINS, EYE_TIMES = 40, 2 * PER_SLOT
 #: Light relative to that of a lit slot, from and to.
 RANGE = (-0.4, 1.6)
 #: Share of an exposure in decided slots from which a sample is compared with them.
@@ -71,16 +71,16 @@ def inspect_frame(taps: Mapping[str, Any], result: FrameResult) -> Inspection:
     columns = np.array([-1 - column.column if result.mirrored else column.column for column in result.columns])
     silent = np.array([not column.packets for column in result.columns])
     lit = np.where(silent[:, None], np.nan, _lit(taps, clock)[columns])
-    samples = sample_slots(_profiles(taps), clock, _PER_SLOT)
+    samples = sample_slots(_profiles(taps), clock, PER_SLOT)
     black_level = estimate_black_level(samples, clock) or 0.0
-    samples, exposure = samples.of_columns(columns), Exposure.of(clock.exposure_slots, _PER_SLOT)
+    samples, exposure = samples.of_columns(columns), Exposure.of(clock.exposure_slots, PER_SLOT)
     mean = exposure.mean_light(np.nan_to_num(lit).astype(np.float32))
     known = exposure.mean_light(np.isfinite(lit).astype(np.float32)) > _ALL
     light, picture = _light_and_picture(samples, mean, known, black_level)
     share = np.where(np.isfinite(picture), mean, np.nan).astype(np.float64)
     relative = light / picture
 
-    places = (np.arange(share.shape[1]) + 0.5) / _PER_SLOT
+    places = (np.arange(share.shape[1]) + 0.5) / PER_SLOT
     row0 = clock.row0 + clock.delay_slots[columns] * clock.rows_per_slot
     rows = row0[:, None] + places * clock.rows_per_slot
     by_column = np.stack([rows, light + black_level, picture * share + black_level, share, relative])
@@ -110,11 +110,11 @@ def _light_and_picture(
     """(C, n) light over black, and the picture as the channel predicts it by the slots; NaN where it does not."""
     light = (samples.light - np.float32(black_level)) * samples.valid
     sums = PictureSums.of(
-        *(by_place(each, _PER_SLOT) for each in (light, mean[:, None], samples.valid * known[:, None]))
+        *(by_place(each, PER_SLOT) for each in (light, mean[:, None], samples.valid * known[:, None]))
     )
     sigma = dark_sigma(light, samples.valid, 0.0, _MIN_SIGMA)
     prediction = predict_picture(sums, sigma**2, SETTINGS.picture_scales[-1:], one_sided=False)
-    picture = in_time(prediction.at_samples(_PER_SLOT)) * samples.valid
+    picture = in_time(prediction.at_samples(PER_SLOT)) * samples.valid
     light, picture = (each.sum(axis=1) / np.maximum(samples.valid.sum(axis=1), 1) for each in (light, picture))
     return light, np.where(known & (picture > sigma), picture, np.nan)
 
@@ -145,8 +145,8 @@ def _eye(relative: FloatArray, places: FloatArray) -> NDArray[np.int64]:
 
 def _residuals(rows: FloatArray, relative: FloatArray, share: FloatArray) -> FloatArray:
     """(m, 2) row and how much later than the clock the light is there, slots: one Gauss-Newton step per window."""
-    size = _RESIDUAL_SLOTS * _PER_SLOT
-    slope = np.gradient(share, 1 / _PER_SLOT, axis=1)
+    size = _RESIDUAL_SLOTS * PER_SLOT
+    slope = np.gradient(share, 1 / PER_SLOT, axis=1)
     error = np.where(np.isfinite(slope), relative - share, np.nan)
     whole = rows.shape[1] // size * size
     rows, slope, error = (values[:, :whole].reshape(-1, size) for values in (rows, slope, error))

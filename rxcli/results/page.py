@@ -3,7 +3,8 @@
 import html
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.resources import data_dir, filled_page
 from rxcli.results.aim import brightness_of, height_share, split_message
 from rxcli.results.columns import column_rows, packet_rows, text_rows
-from rxcli.results.inspection import Inspection, Trace, inspect_frame
+from rxcli.results.inspection import Inspection, Trace
 from rxcli.results.maps import column_map
 from rxcli.results.overlay import picture_of, preview
+from rxcli.results.quality import qualities
 from rxcli.results.record import plain
 from rxcli.results.report import headline, mirror_note, packets_in_words, plural
 from rxcli.types import FloatArray, Frame, FrameResult
@@ -34,7 +36,7 @@ def inspection_page(
     result: FrameResult,
     screen: ScreenProfile | None,
     camera: CameraProfile | None,
-    taps: Mapping[str, Any] | None,
+    known: Inspection | None,
     timeline: Sequence[FrameResult] = (),
 ) -> str:
     """The page of a frame.
@@ -44,10 +46,9 @@ def inspection_page(
         result: what became of it.
         screen: the profile that `result` names.
         camera: the profile that `result` names, or the estimated one.
-        taps: arrays at its stage boundaries, see `rxcli.receiver.receive.receive`; None where reception ended before.
+        known: its light and slots; None where reception ended before.
         timeline: results of all frames of the clip that it is of.
     """
-    known = inspect_frame(taps, result) if taps and result.columns else None
     reason, advice = split_message(result) if result.message else ("", "")
     title, frame_note = headline(result), ""
     if timeline:  # a clip is headed by what all its frames gave
@@ -71,6 +72,7 @@ def inspection_page(
         "packets": packet_rows(result),
         "columns": column_rows(result),
         "inspection": None if known is None else _inspection(known),
+        "quality": [asdict(each) for each in qualities(known, 1 / screen.slot_rate_hz)] if known and screen else [],
         "denoiser": result.denoiser
         and {"corrected": [c.column for c in result.columns if c.denoised], **result.denoiser},
         "times": {name: value for name, value in result.timing_ms.items() if math.isfinite(value)},

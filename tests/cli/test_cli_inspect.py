@@ -53,6 +53,12 @@ def test_a_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFi
     assert [outline["status"] for outline in data["picture"]["outlines"]] == ["ok"] * N_COLUMNS
     assert len(data["inspection"]["traces"]) == len(data["inspection"]["crosstalk"]) == N_COLUMNS
     assert data["maps"]
+    arguments = ["inspect", str(tmp_path / "a<b>.png"), "--out", str(out), *write_profiles(tmp_path)]
+    assert run([*arguments, "--json", "-"]) == 0
+    quality = json.loads(capsys.readouterr().out)["quality"]
+    assert quality == data["quality"]
+    assert [column["column"] for column in quality] == list(range(N_COLUMNS))
+    assert all(column["snr_db"] > 10 and column["contrast"] > 0.5 for column in quality)
 
 
 @pytest.mark.parametrize("name", ["{{data}}", "{{view.js}}", "{{mark}}{{app.css}}", "{{nothing}}"])
