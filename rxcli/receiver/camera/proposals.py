@@ -77,7 +77,19 @@ def propose(
     ranked = sorted(smeared + short, key=lambda clock: -clock.score)
     least = {False: SETTINGS.min_score, True: SETTINGS.min_long_score}
     likely = [clock for clock in ranked if clock.score >= least[clock.exposure_slots > LONG_EXPOSURE_SLOTS]]
-    return [replace(clock, number=number) for number, clock in enumerate(likely or short[:1])]
+    found = [_in_phase(strips, clock, may_bend=may_bend) for clock in likely or short[:1]]
+    return [replace(clock, number=number) for number, clock in enumerate(found)]
+
+
+def _in_phase(strips: ColumnStrips, clock: CameraHypothesis, *, may_bend: bool) -> CameraHypothesis:
+    """A clock of a short exposure with rows per slot and bend by the whole picture, where that is plain."""
+    if clock.exposure_slots > LONG_EXPOSURE_SLOTS:
+        return clock
+    found = along_the_line(strips, clock.rows_per_slot / strips.pitch, SETTINGS.off_clock, may_bend=may_bend)
+    # Lines of text have a phase as well.
+    if found is None or found[2] < 2 * SETTINGS.max_line:
+        return clock
+    return replace(clock, rows_per_slot=found[0] * strips.pitch, curvature=found[1])
 
 
 def propose_slots(strips: ColumnStrips, *, may_bend: bool = True) -> list[CameraHypothesis]:
@@ -232,8 +244,8 @@ def _smeared_clocks(strips: ColumnStrips, exposures: dict[int, float], *, may_be
         exposures: stated exposure in slots by packet length, 0 for none.
         may_bend: whether the camera may have taken a distortion out.
     """
-    for rows, strength, found, change in _long_exposures(strips, is_stated=any(exposures.values())):
-        rows, curvature = along_the_line(strips, rows, may_bend=may_bend)
+    is_stated = any(exposures.values())
+    for rows, curvature, strength, found, change in _long_exposures(strips, may_bend=may_bend, is_stated=is_stated):
         columns = columns_of(straightened(strips, change, curvature), strips.n_columns)
         copies = _surprise(_autocorrelation(_from_their_tops(columns)), round(2 * SLOTS_PER_SYMBOL * rows))
         total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
@@ -287,28 +299,35 @@ def _both_ways(
         )
 
 
-def _long_exposures(strips: ColumnStrips, *, is_stated: bool) -> Iterator[tuple[float, float, float, Float32Array]]:
-    """Rows a slot, strength of their line, exposure in slots and the changes of the light over a slot.
+def _long_exposures(
+    strips: ColumnStrips, *, may_bend: bool, is_stated: bool
+) -> Iterator[tuple[float, FloatArray, float, float, Float32Array]]:
+    """Rows a slot, bend, strength of their line, exposure in slots and the changes of the light over a slot.
 
     None if the strongest line is of a short exposure.
     """
     lines = slot_lines(strips)
     # Lines of noise have a strength of 2 on average.
-    least = 2 + SETTINGS.min_slot_line
-    lines = [line for line in lines if line[1] >= max(SETTINGS.min_line_share * lines[0][1], least)]
+    least = max(2 + SETTINGS.min_slot_line, SETTINGS.min_line_share * max((line[1] for line in lines), default=0.0))
+    lines = [(rows, strength) for rows, strength in lines if strength >= least]
     # Of light that is exposed for half a slot more than whole ones the line is at twice the rate.
-    lines += [(2 * rows, strength) for rows, strength in lines if not _is_among(2 * rows, lines)]
-    for number, (rows, strength) in enumerate(lines):
+    reach = SETTINGS.off_line
+    tried = [along_the_line(strips, order * rows, reach, may_bend=may_bend) for order in (1, 2) for rows, _ in lines]
+    tried += [(rows, np.zeros(4), strength) for rows, strength in lines if rows <= SETTINGS.min_phase_rows]
+    found = sorted((line for line in tried if line), key=lambda line: -line[2])
+    for number, (rows, curvature, strength) in enumerate(found):
+        if strength < SETTINGS.min_line_share * found[0][2] or _is_among(rows, found[:number]):
+            continue
         change, _ = changes_over(strips.light, strips.inside, rows, strips.noise.sigma)
         exposure = exposure_by_changes(columns_of(change, strips.n_columns), rows)
         if exposure > LONG_EXPOSURE_SLOTS or is_stated:
-            yield rows, strength, exposure, change
+            yield rows, curvature, strength, exposure, change
         elif number == 0:
             return
 
 
-def _is_among(rows: float, lines: list[tuple[float, float]]) -> bool:
-    return any(abs(np.log(rows / known)) < SETTINGS.same_clock for known, _ in lines)
+def _is_among(rows: float, lines: Sequence[tuple[float, ...] | tuple[float, FloatArray, float]]) -> bool:
+    return any(abs(np.log(rows / line[0])) < SETTINGS.same_clock for line in lines)
 
 
 def exposure_by_changes(columns: Float32Array, rows_per_slot: float) -> float:
@@ -400,21 +419,26 @@ def _turns(strips: ColumnStrips, lag: int) -> tuple[Float32Array, ...]:
     return product, turns
 
 
-def along_the_line(strips: ColumnStrips, rows: float, *, may_bend: bool) -> tuple[float, FloatArray]:
-    """Rows a slot, and the bend of the stripes, by which the turns of the light in the whole picture are in phase.
+def along_the_line(
+    strips: ColumnStrips, rows: float, reach: float, *, may_bend: bool
+) -> tuple[float, FloatArray, float] | None:
+    """Rows a slot, and bend, by which the turns of the light in the whole picture are in phase, and how much they are.
+
+    None if they stand out no more than by chance.
 
     Blocks of a few slots of each column have a phase at the rate of the slots. The rate and the bend under which they
     agree are sought on a grid and then by Newton's method, with the lens as it is before the picture is seen.
 
     Args:
         strips: of the picture.
-        rows: a slot, about, from `slot_lines`.
+        rows: a slot, about.
+        reach: how far they may be off, relatively.
         may_bend: whether the camera may have taken a distortion out.
     """
     lag = min(SETTINGS.turn_lags, key=lambda lag: abs(np.log(rows / lag / np.prod(SETTINGS.slot_lags) ** 0.5)))
-    parts = _turns(strips, lag)
+    parts = _turns(strips, lag) if rows > SETTINGS.min_phase_rows else ()
     if not parts:
-        return rows, np.zeros(4)
+        return None
     size = max(round(SETTINGS.block_slots * rows), 1)
     n = parts[0].shape[1] // size
     middle = lag + (np.arange(n) + 0.5) * size - 0.5
@@ -431,13 +455,21 @@ def along_the_line(strips: ColumnStrips, rows: float, *, may_bend: bool) -> tupl
             blocks.append((order, block / np.linalg.norm(block)))
     bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, SETTINGS.n_bends) * may_bend
     grid = np.array([[k1, share * k1, 0, 0] for k1 in bends for share in SETTINGS.bend_shares])
-    off = np.linspace(-SETTINGS.max_off_line, SETTINGS.max_off_line, SETTINGS.n_off_line)
+    off = np.arange(-reach, reach, SETTINGS.step_off)
     wave = np.exp(-2j * np.pi * (middle + np.tensordot(grid, terms, 1)) / rows)
     nearby = np.exp(-2j * np.pi * middle[:, None] * off / rows)
     score = sum(np.abs((wave**order * block).sum(axis=1) @ nearby**order) ** 2 for order, block in blocks)
     score = score - np.einsum("bi,ij,bj->b", grid, LENS_PRECISION, grid)[:, None] / 2
-    best, shift = np.unravel_index(np.argmax(score), score.shape)
-    values = np.append((1 + off[shift]) / rows, grid[best])
+    # Mosaic and JPEG show as periods of 4, 8 / 3 and 2 rows.
+    eighths = 8 * (1 + off) / rows
+    score[:, (np.abs(eighths - np.rint(eighths)) < 16 / strips.rows.size) & (eighths > 1.5)] = 0
+    by_bend = score.max(axis=1)
+    best, straight = int(by_bend.argmax()), int(np.abs(grid).sum(axis=1).argmin())
+    if by_bend[best] < 2 * SETTINGS.min_slot_line:
+        return None
+    if by_bend[best] < by_bend[straight] + SETTINGS.min_slot_line:
+        best, may_bend = straight, False
+    values = np.append((1 + off[score[best].argmax()]) / rows, grid[best])
     prior, free = np.zeros((5, 5)), slice(0, 5 if may_bend else 1)
     prior[1:, 1:] = LENS_PRECISION
     for _ in range(SETTINGS.line_steps):
@@ -451,7 +483,7 @@ def along_the_line(strips: ColumnStrips, rows: float, *, may_bend: bool) -> tupl
             normal += order * (around * np.maximum(turned.real, 0)) @ around.T
             pull += around @ turned.imag
         values[free] += np.linalg.solve(normal, pull)
-    return 1 / float(values[0]), values[1:]
+    return 1 / float(values[0]), values[1:], float(by_bend[best])
 
 
 def _line_spectrum(values: Float32Array, lag: int, size: int) -> FloatArray:

@@ -61,12 +61,15 @@ class EstimateSettings(msgspec.Struct, frozen=True):
     #: Percentile of the light that counts as black; least light above it.
     dark_percent: float = 0.5
     min_light: float = 1e-4
-    #: Slots of a block whose phase is that of its middle; k2 of the bends that are tried, times k1; relative distance
-    #: of rows a slot from their line up to which they are sought, and number of distances; steps from there.
+    #: Slots of a block whose phase is that of its middle; fewest rows of a slot whose phase shows; k2 of the bends that
+    #: are tried, times k1; relative distances of rows a slot from their line, and from the clock of a short exposure,
+    #: up to which they are sought, and between two that are tried; steps from there.
     block_slots: float = 6.0
+    min_phase_rows: float = 3.0
     bend_shares: tuple[float, ...] = (0.0, -0.5, -1.0, -2.0)
-    max_off_line: float = 0.08
-    n_off_line: int = 321
+    off_line: float = 0.08
+    off_clock: float = 0.012
+    step_off: float = 5e-4
     line_steps: int = 12
     #: Bins around a line that it is compared with; distance of the mosaic's line, cycles a row.
     line_bins: int = 801

@@ -223,7 +223,10 @@ class _Walk:
                 return self._siblings, heapq.heappop(self._siblings)
             # A long exposure that no file states explains the light of a short one to some extent.
             is_open = is_estimated and best.reception.is_long and self._proposer.cache.frame.metadata.exposure_s is None
-            if best.evidence > (SETTINGS.plain_estimate if is_estimated else SETTINGS.plain) and not is_open:
+            # A wrong length of packets explains light to some extent, but gives none.
+            shows_packets = bool((best.reception.best_confidence() > SETTINGS.likely_certainty).any())
+            is_plain = best.evidence > (SETTINGS.plain_estimate if is_estimated and shows_packets else SETTINGS.plain)
+            if is_plain and not is_open:
                 return None
         while self._cameras is not None and (not self._fresh or self._next_prior > -self._fresh[0][0]):
             try:

@@ -22,6 +22,7 @@ from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, dump_pro
 from rxcli.receiver import camera as blind
 from rxcli.receiver import plane
 from rxcli.receiver.camera import proposals
+from rxcli.receiver.camera.curvature import curvature_terms
 from rxcli.receiver.camera.proposals import stripe_rows
 from rxcli.receiver.camera.settings import SETTINGS
 from rxcli.receiver.light import NoiseModel
@@ -128,6 +129,20 @@ def test_an_exposure_that_no_file_states_is_proposed(exposure_slots: float) -> N
     best = blind.propose(strips_of(frame, corners), SCREENS)[0]
     assert best.rows_per_slot == pytest.approx(rows_per_slot, rel=3e-3 if is_long else 5e-3)
     assert best.exposure_slots == pytest.approx(exposure_slots, abs=0.25 if is_long else 0.4)
+
+
+@pytest.mark.parametrize(("exposure_slots", "k1"), [(0.8, 0.09), (4.0, 0.09), (4.0, -0.06)])
+def test_the_light_of_all_rows_shows_rows_per_slot_and_bend_before_packets(exposure_slots: float, k1: float) -> None:
+    screen, rows_per_slot, height = ("paper-8k65", 7.7, 1500)
+    frame, corners, truth = phone(screen, rows_per_slot, height, corrected=True, k1=k1, exposure_slots=exposure_slots)
+    strips = strips_of(frame, corners)
+    best = blind.propose(strips, SCREENS)[0]
+    assert best.rows_per_slot == pytest.approx(rows_per_slot, rel=1.5e-3)
+    lens = truth["camera"]["dist_coeffs"]
+    true = np.array([lens[0] / 0.8**2, lens[1] / 0.8**4, lens[2] / 0.8, lens[3] / 0.8])
+    moved = np.tensordot(best.curvature - true, curvature_terms(strips.x, strips.rows, frame.width, frame.height), 1)
+    off = moved / rows_per_slot + strips.rows * (1 / best.rows_per_slot - 1 / rows_per_slot)
+    assert off[strips.inside > 0].std() < 0.06
 
 
 @pytest.mark.parametrize(("corrected", "k1"), [(False, 0.0), (True, 0.09)])
