@@ -9,7 +9,7 @@ lamp's region is then summed to one profile and fitted (`rxcli.calibrate.periodi
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -25,6 +25,8 @@ from rxcli.profiles import LensModel
 from rxcli.types import BoolArray, FloatArray, IntArray
 
 Axis = Literal["rows", "columns"]
+#: Whether it has few periods, negative worth, most likely frequency, strips [from, to) and rows [from, to) of a window.
+_Candidate = tuple[int, float, float, int, int, int, int]
 Picture = NDArray[np.float32] | NDArray[np.float64]
 #: Left, top, right, bottom, stored pixels; right and bottom are outside.
 Box = tuple[int, int, int, int]
@@ -36,7 +38,7 @@ _MAX_LAMPS = 8
 #: Share of textures taken for a lamp, where textures lie within `_TEXTURE_LEAN` radians of the lines at any angle.
 _FALSE_ALARM, _TEXTURE_LEAN = 0.01, 0.1
 #: Windows that are fitted in search of a lamp; fewest periods of a lamp in a spot.
-_MAX_TRIED, _MIN_SPOT_PERIODS = 3, 2.5
+_MAX_TRIED, _MIN_SPOT_PERIODS = 2, 2.5
 #: Stripes that are enough wherever they are.
 _ENOUGH_PERIODS = 6
 #: Logarithm of the ratio of two line delays that may still be one.
@@ -85,18 +87,6 @@ class Stripes:
     def area_px(self) -> int:
         """Pixels of the region."""
         return _common_area(self.bounds, self.bounds)
-
-
-class _Candidate(NamedTuple):
-    """A window of strips and rows with its most likely frequency; the clearest is the smallest."""
-
-    few: int
-    negative_worth: float
-    frequency: float
-    strip: int
-    end_strip: int
-    start: int
-    stop: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,21 +252,20 @@ def _candidates(strips: FloatArray) -> list[_Candidate]:
                     if score > 0:
                         # Among equally clear windows the longer one determines the frequency better.
                         worth = score * np.log(length)
-                        found.append(_Candidate(few, -worth, frequency, *runs[run], start, start + length))
+                        found.append((few, -worth, frequency, *runs[run], start, start + length))
     return sorted(found)
 
 
 def _seed(strips: FloatArray, free: BoolArray, candidates: list[_Candidate]) -> PeriodicFit | None:
     """The first significant fit of the clearest windows that are free, one window a span of rows."""
     tried: set[tuple[int, int, int]] = set()
-    for window in candidates:
-        span = (window.few, window.start, window.stop)
-        n_tried = sum(few == window.few for few, *_ in tried)
-        cells = slice(window.strip, window.end_strip), slice(window.start, window.stop)
-        if span in tried or n_tried == _MAX_TRIED or not free[cells].all():
+    for few, _, frequency, strip, end_strip, start, stop in candidates:
+        n_tried = sum(number == few for number, *_ in tried)
+        cells = slice(strip, end_strip), slice(start, stop)
+        if (few, start, stop) in tried or n_tried == _MAX_TRIED or not free[cells].all():
             continue
-        tried.add(span)
-        fit = fit_fundamental(strips[cells].mean(axis=0), window.frequency, window.start)
+        tried.add((few, start, stop))
+        fit = fit_fundamental(strips[cells].mean(axis=0), frequency, start)
         if fit is not None and fit.significant:
             return fit
     return None
