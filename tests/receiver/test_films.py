@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -66,6 +67,17 @@ def test_a_film_gives_what_its_frames_give_one_by_one(shows: str) -> None:
     assert surely_wrong(results) == 0
 
 
+def test_a_film_received_promptly_gives_the_same_and_certain_frames_are_passed_over() -> None:
+    """As by a live camera, whose first results are not held back until doubts are settled."""
+    scene = scene_in_hand(0.0, 24, film=Film("pan:-3"), frame_rate_hz=30.0, picture="chelsea")
+    clip = filmed_by(prepare(replace(scene, screen=msgspec.structs.replace(scene.screen, repeats=14)), SEED))
+    _, every = received(clip)
+    results, score = received(clip, prompt=True, stop_when_certain=True)
+    assert any(result.skipped.get("certain_frames") for result in results)
+    assert score.error_free == every.error_free > 0
+    assert score.false == surely_wrong(results) == 0
+
+
 # -- where the screen is -----------------------------------------------------------------------------------------------
 
 
@@ -118,13 +130,13 @@ def test_columns_are_found_beside_where_they_were_read() -> None:
     picture = rng.uniform(0.2, 0.5, (N_COLUMNS, n_strips, n_rows)).astype(np.float32)
     bits = rng.integers(0, 2, (N_COLUMNS, n_rows // 5 + 2)).astype(np.float32)
     slots = SlotLight(bits).mean_over(np.arange(n_rows)[None] / 5 + 0.5, 1.0)
-    known = KnownPicture(picture.shape, Crosstalk.of(n_strips, spread), 0.0, NoiseModel(1e-6, 0.0))
-    inside, ones = np.ones(picture.shape, bool), np.ones_like(slots)
+    known = KnownPicture(picture.shape, 0.0, NoiseModel(1e-6, 0.0))
+    inside, ones, crosstalk = np.ones(picture.shape, bool), np.ones_like(slots), Crosstalk.of(n_strips, spread)
     for _ in range(3):
-        known.learn(Observation(light_at(picture, slots, np.zeros(N_COLUMNS), spread), slots, ones, inside))
+        known.learn(Observation(light_at(picture, slots, np.zeros(N_COLUMNS), spread), slots, ones, inside, crosstalk))
     off = np.linspace(-0.05, 0.1, N_COLUMNS)
     near, far = (Crosstalk.of(n_strips, spread, offset=each).shares for each in (-0.01, 0.01))
-    found = known.placed(inside).displacement(
+    found = known.placed(inside, crosstalk).displacement(
         light_at(picture, slots, off, spread), slots, ((far - near) / 0.02).astype(np.float32)
     )
     assert found is not None
@@ -150,15 +162,15 @@ def test_a_picture_follows_the_light_of_a_frame_that_it_does_not_explain() -> No
     rng = np.random.default_rng(6)
     shape = (6, 4, 400)
     crosstalk = Crosstalk(np.tile([0.0, 1.0, 0.0], (4, 1)))
-    known, inside = KnownPicture(shape, crosstalk, 0.0, NoiseModel(1e-6, 0.0)), np.ones(shape, bool)
+    known, inside = KnownPicture(shape, 0.0, NoiseModel(1e-6, 0.0)), np.ones(shape, bool)
     picture = rng.uniform(0.2, 0.5, (6, 4, 1)).astype(np.float32) * np.ones(shape, np.float32)
     words = np.stack([rng.permutation([0, 1] * 5) for _ in range(6 * 9)]).reshape(6, -1).astype(np.float32)
     slots = SlotLight(words).mean_over(np.arange(shape[2])[None] / 5 + 0.5, 1.0)
     for _ in range(10):
-        known.learn(Observation(picture * slots[:, None], slots, np.ones_like(slots), inside))
+        known.learn(Observation(picture * slots[:, None], slots, np.ones_like(slots), inside, crosstalk))
     changed = picture.copy()
     changed[:3] *= 0.5
-    placed = known.placed(inside)
+    placed = known.placed(inside, crosstalk)
     adapted = placed.adapted(changed * slots[:, None], None, 5.0).picture[..., 60:-60]
     changed, before = changed[..., 60:-60], placed.picture[..., 60:-60]
     assert np.abs(adapted[:3] / changed[:3] - 1).mean() < 0.1
@@ -169,11 +181,11 @@ def test_a_picture_that_moves_on_the_screen_keeps_what_stays_on_it() -> None:
     rng = np.random.default_rng(7)
     shape, shift = (6, 4, 100), 5
     crosstalk, ones = Crosstalk(np.tile([0.0, 1.0, 0.0], (4, 1))), np.ones((6, 100), np.float32)
-    known, inside = KnownPicture(shape, crosstalk, 0.0, NoiseModel(1e-6, 0.0)), np.ones(shape, bool)
+    known, inside = KnownPicture(shape, 0.0, NoiseModel(1e-6, 0.0)), np.ones(shape, bool)
     picture = np.repeat(rng.uniform(0.2, 0.5, (24, 1)), 100, axis=1).reshape(shape).astype(np.float32)
     for _ in range(10):
-        update = known.learn(Observation(picture, ones, ones, inside))
-    elsewhere = known.placed(np.ones(shape, bool), None, shift).picture.reshape(24, 100)
+        update = known.learn(Observation(picture, ones, ones, inside, crosstalk))
+    elsewhere = known.placed(np.ones(shape, bool), crosstalk, None, shift).picture.reshape(24, 100)
     assert elsewhere[shift:] == pytest.approx(picture.reshape(24, 100)[:-shift], rel=0.05)
-    left = known.without(update).placed(np.ones(shape, bool), None, shift).picture.reshape(24, 100)
+    left = known.without(update).placed(np.ones(shape, bool), crosstalk, None, shift).picture.reshape(24, 100)
     assert left[shift:] == pytest.approx(picture.reshape(24, 100)[:-shift], rel=0.05)

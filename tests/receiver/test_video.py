@@ -198,11 +198,11 @@ def test_products_take_one_thread_while_a_frame_is_received(clip: Clip, monkeypa
     def threads() -> list[int]:
         return [library["num_threads"] for library in blas.info() if _is_numpys(library)]
 
-    def step(state: object, frame: Frame) -> tuple[object, list[FrameResult]]:
+    def add(_receiver: object, frame: Frame) -> list[FrameResult]:
         inside.append(threads())
-        return state, [FrameResult(frame.source, 0, 0.0, "no_screen")]
+        return [FrameResult(frame.source, 0, 0.0, "no_screen")]
 
-    monkeypatch.setattr("rxcli.receiver.clip.receiver.step", step)
+    monkeypatch.setattr("rxcli.receiver.clip.receiver.ClipReceiver.add", add)
     with blas.limit(limits=2, user_api="blas"):
         if max(threads(), default=0) < 2:
             pytest.skip("this numpy's BLAS has one thread")
@@ -347,7 +347,7 @@ def test_known_picture_gives_back_the_columns_light() -> None:
     picture = rng.uniform(0.02, 0.5, (columns, strips, rows)).astype(np.float32)
     crosstalk = rng.uniform(0.1, 1.0, (strips, 3))
     inside = np.ones(picture.shape, bool)
-    known = KnownPicture(picture.shape, Crosstalk(crosstalk), black_level, NoiseModel(1e-7, 1e-6))
+    known = KnownPicture(picture.shape, black_level, NoiseModel(1e-7, 1e-6))
 
     def frame() -> tuple[np.ndarray, np.ndarray]:
         bits = rng.integers(0, 2, (columns, 42)).astype(np.float32)
@@ -362,19 +362,22 @@ def test_known_picture_gives_back_the_columns_light() -> None:
 
     for _ in range(25):
         light, slots = frame()
-        known.learn(Observation(light, slots, np.ones_like(slots), inside))
+        known.learn(Observation(light, slots, np.ones_like(slots), inside, Crosstalk(crosstalk)))
     light, slots = frame()
-    reception = known.placed(inside).solve(light)
+    reception = known.placed(inside, Crosstalk(crosstalk)).solve(light)
     assert np.abs(reception.value - slots).max() < 0.1
     assert (reception.precision > 0).all()
 
 
-def known_picture(rng: np.random.Generator, columns: int = 6, strips: int = 4, rows: int = 400) -> tuple[Any, ...]:
+#: Crosstalk of four strips that receive the light of their column alone.
+OWN_LIGHT = Crosstalk(np.tile([0.0, 1.0, 0.0], (4, 1)))
+
+
+def known_picture(rng: np.random.Generator, columns: int = 6, rows: int = 400) -> tuple[Any, ...]:
     """A picture known from many frames, 5 rows a slot; and what makes a frame of it: light and exposed slots."""
-    picture = rng.uniform(0.1, 0.5, (columns, strips, rows)).astype(np.float32)
-    crosstalk = np.tile([0.0, 1.0, 0.0], (strips, 1))
+    picture = rng.uniform(0.1, 0.5, (columns, 4, rows)).astype(np.float32)
     inside = np.ones(picture.shape, bool)
-    known = KnownPicture(picture.shape, Crosstalk(crosstalk), 0.0, NoiseModel(1e-6, 0.0))
+    known = KnownPicture(picture.shape, 0.0, NoiseModel(1e-6, 0.0))
 
     def frame() -> tuple[Float32Array, Float32Array]:
         bits = rng.integers(0, 2, (columns, rows // 5 + 2)).astype(np.float32)
@@ -383,7 +386,7 @@ def known_picture(rng: np.random.Generator, columns: int = 6, strips: int = 4, r
 
     for _ in range(20):
         light, slots = frame()
-        known.learn(Observation(light, slots, np.ones_like(slots), inside))
+        known.learn(Observation(light, slots, np.ones_like(slots), inside, OWN_LIGHT))
     return known, frame
 
 
@@ -392,7 +395,7 @@ def test_strips_that_show_something_else_are_trusted_less() -> None:
     known, frame = known_picture(rng)
     light, slots = frame()
     light[:, 0] += rng.normal(0, 0.2, light[:, 0].shape).astype(np.float32)
-    placed = known.placed(np.ones(light.shape, bool))
+    placed = known.placed(np.ones(light.shape, bool), OWN_LIGHT)
     plain = np.abs(placed.solve(light).value - slots).mean()
     again = np.abs(placed.solve_again(light, slots, 5.0).value - slots).mean()
     assert again < 0.5 * plain
@@ -404,7 +407,7 @@ def test_a_decision_does_not_bear_itself_out() -> None:
     light, slots = frame()
     wrong = slots.copy()
     wrong[2, 200:205] = 1 - wrong[2, 200:205]
-    placed = known.placed(np.ones(light.shape, bool))
+    placed = known.placed(np.ones(light.shape, bool), OWN_LIGHT)
     reception = placed.solve_again(light, wrong, 5.0).value[2, 201:204]
     assert np.abs(reception - slots[2, 201:204]).max() < 0.1
 
@@ -413,7 +416,7 @@ def test_a_picture_without_a_frame_is_that_of_the_others() -> None:
     known, frame = known_picture(np.random.default_rng(10))
     other = copy.deepcopy(known)
     light, slots = frame()
-    look = Observation(light, slots, np.full_like(slots, 0.7), np.ones(light.shape, bool))
+    look = Observation(light, slots, np.full_like(slots, 0.7), np.ones(light.shape, bool), OWN_LIGHT)
     update = known.learn(look, forget=False)
     with_it, _ = known.picture()
     without, _ = known.without(update).picture()
@@ -427,11 +430,11 @@ def test_errors_that_rows_have_in_common_count_as_one(together: int) -> None:
     """Noise of the same variance on every row alone, or on five rows at a time: the latter leaves less to be told."""
     rng = np.random.default_rng(11)
     inside = np.ones((8, 1, 1000), bool)
-    known = KnownPicture(inside.shape, Crosstalk(np.array([[0.0, 1.0, 0.0]])), 0.0, NoiseModel(1e-4, 0.0))
+    known = KnownPicture(inside.shape, 0.0, NoiseModel(1e-4, 0.0))
     noise = np.repeat(rng.normal(0, 0.1, (8, 1000 // together)), together, axis=1).astype(np.float32)
     slots = np.repeat(rng.integers(0, 2, (8, 200)), 5, axis=1).astype(np.float32)
     seen = ColumnLight(slots + noise, np.full((8, 1000), 50, np.float32))
-    judged = known.placed(inside).judge(seen, slots, 40.0, 0.0, 5.0)
+    judged = known.placed(inside, Crosstalk(np.array([[0.0, 1.0, 0.0]]))).judge(seen, slots, 40.0, 0.0, 5.0)
     # Each row tells 1 / 0.1^2, whatever was foreseen; five that err together tell what one does.
     expected = 100 / together
     assert np.median(judged.precision) == pytest.approx(expected, rel=0.1)
@@ -441,13 +444,13 @@ def test_black_parts_of_a_picture_show_no_slots() -> None:
     """The black bar of a letterboxed picture, whose slots are unknown: it is black whatever is sent."""
     rng = np.random.default_rng(12)
     inside = np.ones((3, 4, 300), bool)
-    known = KnownPicture(inside.shape, Crosstalk(np.tile([0.0, 1.0, 0.0], (4, 1))), 0.0, NoiseModel(1e-7, 1e-4))
+    known = KnownPicture(inside.shape, 0.0, NoiseModel(1e-7, 1e-4))
     slots = np.repeat(rng.integers(0, 2, (3, 60)), 5, axis=1).astype(np.float32)
     light = (0.3 * slots[:, None] + rng.normal(0, 3e-4, (3, 4, 300))).astype(np.float32)
     slots[:, 200:] = 0.5
     light[..., 200:] = rng.normal(0, 3e-4, (3, 4, 100))
-    known.learn(Observation(light, slots, np.abs(2 * slots - 1), inside))
-    precision = known.placed(inside).solve(light).precision
+    known.learn(Observation(light, slots, np.abs(2 * slots - 1), inside, OWN_LIGHT))
+    precision = known.placed(inside, OWN_LIGHT).solve(light).precision
     assert np.median(precision[:, :200]) > 50
     assert np.median(precision[:, 250:]) < 0.2
 
@@ -455,17 +458,18 @@ def test_black_parts_of_a_picture_show_no_slots() -> None:
 def test_rows_that_were_never_lit_are_not_known() -> None:
     """Light that neighbours spill is no look at a picture: what is lit there at last is not taken for dark."""
     inside = np.ones((3, 1, 60), bool)
-    known = KnownPicture(inside.shape, Crosstalk(np.array([[0.05, 0.9, 0.05]])), 0.0, NoiseModel(1e-6, 1e-6))
+    crosstalk = Crosstalk(np.array([[0.05, 0.9, 0.05]]))
+    known = KnownPicture(inside.shape, 0.0, NoiseModel(1e-6, 1e-6))
     lit = np.zeros((3, 60), np.float32)
     lit[0] = 1.0
     # The model has it that the neighbour spills a twentieth; three times as much comes.
     light = np.where(np.arange(3)[:, None] == 1, 0.15, 0.9)[:, None] * np.ones((3, 1, 60)) * lit[:1]
     for _ in range(4):
-        known.learn(Observation(light.astype(np.float32), lit, np.ones((3, 60), np.float32), inside))
+        known.learn(Observation(light.astype(np.float32), lit, np.ones((3, 60), np.float32), inside, crosstalk))
     both = lit.copy()
     both[1] = 1.0
     now = (np.array([0.95, 0.95, 0.05])[:, None, None] * np.ones((3, 1, 60))).astype(np.float32)
-    seen = known.placed(inside).solve(now)
+    seen = known.placed(inside, crosstalk).solve(now)
     assert (seen.precision[1] * (1 - seen.value[1]) < 8).all()
 
 

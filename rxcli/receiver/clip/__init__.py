@@ -1,7 +1,7 @@
 """Clips: what one frame teaches is used on the next. The stages are those of `rxcli.receiver.receive`.
 
-`receiver` has the three states and the step from frame to frame. The first frames agree on an outline (`acquiring`)
-and, where each shows little, on a clock (`common_clock`); the camera is known or estimated (`camera`). From then on
+`receiver` has the window of first frames and the stream after it. They agree on an outline (`acquiring`) and, where
+each shows little, on a clock (`common_clock`); the camera is known or estimated (`camera`). From then on
 outline, clock, picture and light spread are known: the strips are read where they were (`plane.tracked`), the picture
 is taken out (`scene`, by `channel.known_picture`), the clock is predicted and checked against the header
 (`sync.tracking`). Where the check fails, the frame is received like a photograph again. The link's time numbers the

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rxcli.profiles import ScreenProfile
 from rxcli.receiver.clip.camera import ClipCamera, Located
-from rxcli.receiver.clip.common_clock import Start, hides_headers, start_by
+from rxcli.receiver.clip.common_clock import Start, common_clock, hides_headers, start_by
 from rxcli.receiver.clip.ends import dark_ends
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.cache import FrameCache
@@ -52,7 +53,7 @@ def agreeing(places: Sequence[Place]) -> list[Place]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FirstFrames:
+class Window:
     """The first frames, until they show screen and camera."""
 
     frames: tuple[Frame, ...]
@@ -64,7 +65,7 @@ class FirstFrames:
     start: Start | None = None
 
     @classmethod
-    def begin(cls, frame: Frame, camera: ClipCamera, *, may_wait: bool) -> FirstFrames:
+    def begin(cls, frame: Frame, camera: ClipCamera, *, may_wait: bool) -> Window:
         """Search the first frame."""
         located = camera.locate(FrameCache(frame))
         return cls((frame,), located, is_hidden=may_wait and not (isinstance(located, Located) and located.is_shown))
@@ -81,32 +82,69 @@ class FirstFrames:
             return SETTINGS.frames_in_doubt
         return SETTINGS.first_frames if self.located.shows_little or is_unsure else 1
 
-    def with_frame(self, frame: Frame, camera: ClipCamera) -> FirstFrames:
+    @property
+    def is_complete(self) -> bool:
+        """Whether the frames are enough."""
+        return len(self.frames) >= self.n_needed
+
+    def is_like(self, frame: Frame) -> bool:
+        """Whether a frame is as large as these."""
+        pixels = self.frames[0].pixels
+        return frame.pixels.shape == pixels.shape and frame.pixels.dtype == pixels.dtype
+
+    def with_frame(self, frame: Frame, camera: ClipCamera) -> Window:
         """These frames and one more, which is searched as long as the camera is unsure."""
         located = self.located
-        is_enough = self.is_hidden or len(self.frames) >= self.n_needed
+        is_enough = self.is_hidden or self.is_complete
         if isinstance(located, Located) and not is_enough and located.needs_surer_camera:
             located = located.with_surer_camera(camera.locate(FrameCache(frame)))
         return replace(self, frames=(*self.frames, frame), located=located)
 
-    def shown(self, camera: ClipCamera) -> FirstFrames:
-        """The frames with what the first of them shows, by itself or without what all of them have in common."""
-        alone = self.located
-        if len(self.frames) > 1:
-            texture = CommonTexture(self.frames, DEFAULT_TONE)
-            found = self._without_texture(camera, texture)
-            if found is not None and (
-                isinstance(alone, Failure) or alone.is_bent or alone.is_long or found.evidence > alone.evidence
-            ):
-                return found.with_ends(texture)
-            if isinstance(alone, Located) and isinstance(alone.found, Found) and alone.is_long:
-                start = start_by(alone.found, self.frames) if hides_headers(alone.found) else None
-                located = self._agreed_with_following(alone, camera, texture)
-                return FirstFrames(self.frames, located, start=start).with_ends(texture)
-        shown = FirstFrames(self.frames[:1], alone)
+    def searched(self, camera: ClipCamera, *, are_all: bool) -> Window:
+        """The frames with what the first of them shows, once they are enough to take its texture away."""
+        if not self.is_hidden or not (self.is_complete or are_all):
+            return self
+        return self._without_common_texture(camera) or self._alone(camera)
+
+    def with_clock(self, screens: Sequence[ScreenProfile]) -> Window:
+        """The window with the clock on which the frames agree, where each shows too little of it.
+
+        An estimated camera may have seen any of the `screens`.
+        """
+        located, start = self.located, self.start
+        assert isinstance(located, Located)
+        if start is None and len(self.frames) > 1:
+            if isinstance(located.found, Found) and hides_headers(located.found):
+                start = start_by(located.found, self.frames)
+            elif located.shows_little and (agreed := common_clock(self.frames, located.context, screens)) is not None:
+                start, context = agreed
+                located = replace(located, context=context)
+        if not (located.is_plain or located.is_long):
+            located = replace(located, found=None)  # Of few packets, a second search finds clock and exposure better.
+        return replace(self, located=located, start=start)
+
+    def _alone(self, camera: ClipCamera) -> Window:
+        """The frames with what the first of them shows by itself."""
+        shown = Window(self.frames[:1], self.located)
         for frame in self.frames[1:]:
             shown = shown.with_frame(frame, camera)
         return shown
+
+    def _without_common_texture(self, camera: ClipCamera) -> Window | None:
+        """The frames with what they show without the texture that all have in common; None where that is not more."""
+        alone = self.located
+        if len(self.frames) < 2:
+            return None
+        texture = CommonTexture(self.frames, DEFAULT_TONE)
+        found = self._without_texture(camera, texture)
+        is_open = isinstance(alone, Failure) or alone.is_bent or alone.is_long
+        if found is not None and (is_open or found.evidence > self.evidence):
+            return found.with_ends(texture)
+        if isinstance(alone, Located) and isinstance(alone.found, Found) and alone.is_long:
+            start = start_by(alone.found, self.frames) if hides_headers(alone.found) else None
+            located = self._agreed_with_following(alone, camera, texture)
+            return Window(self.frames, located, start=start).with_ends(texture)
+        return None
 
     def _agreed_with_following(self, alone: Located, camera: ClipCamera, texture: CommonTexture) -> Located:
         """The first frame with the outline on which it and some frames after it agree, each searched as it is."""
@@ -127,13 +165,13 @@ class FirstFrames:
             return self.start.log_evidence
         return self.located.evidence if isinstance(self.located, Located) else 0.0
 
-    def with_ends(self, texture: CommonTexture) -> FirstFrames:
+    def with_ends(self, texture: CommonTexture) -> Window:
         """The same with the ends of the screen by what blinks in the frames."""
         assert isinstance(self.located, Located)
         ends = dark_ends(self.frames, texture.shifts, self.located.context)
         return replace(self, located=replace(self.located, dark_ends=ends))
 
-    def _without_texture(self, camera: ClipCamera, texture: CommonTexture) -> FirstFrames | None:
+    def _without_texture(self, camera: ClipCamera, texture: CommonTexture) -> Window | None:
         """What the first frame shows without its texture: surest camera and median outline of some that agree.
 
         None where it shows no packets.
@@ -156,10 +194,10 @@ class FirstFrames:
         outline = replace(best.outline, corners=corners, strips=None, grid=None)
         there = replace(camera, context=best.context).locate(flat, [outline], may_bend=False)
         if isinstance(there, Located) and self._was_hidden(there) and Place.of(there).agrees(surest):
-            return FirstFrames(self.frames, there)
+            return Window(self.frames, there)
         context = replace(best.context, cache=flat, sampled_corners=outline.corners)
         located = Located(outline, context, None, best.framing)
-        return FirstFrames(self.frames, located, start=start_by(best.found, self.frames))
+        return Window(self.frames, located, start=start_by(best.found, self.frames))
 
     def _places_that_agree(self, camera: ClipCamera, texture: CommonTexture, flat: FrameCache) -> list[Place]:
         """What some frames show without their texture and agree on; `flat` is the first of them so."""

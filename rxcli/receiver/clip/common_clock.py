@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.numerics import NORMAL_MEDIAN, TINY, folded
+from rxcli.numerics import NORMAL_MEDIAN, TINY
 from rxcli.profiles import ScreenProfile
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.clip.settings import SETTINGS
@@ -20,7 +20,7 @@ from rxcli.receiver.search import Found
 from rxcli.receiver.sync import clock as sync
 from rxcli.receiver.sync.settings import SETTINGS as sync_settings
 from rxcli.receiver.sync.tracking import LinkTime, slot_of_row_0
-from rxcli.types import Clock, FloatArray, Frame, RowProfiles
+from rxcli.types import Clock, FloatArray, Frame, IntArray, RowProfiles
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,69 +114,58 @@ def _possible_contexts(
 
 def _starts(frames: Sequence[Frame], context: FrameContext) -> Iterator[Start]:
     """The clock of each screen that all frames together show; `context` is of the first of them."""
-    line_delay_s = context.camera.line_delay_s
-    period_s, numbers = _period_s(frames), np.array([frame.index for frame in frames])
+    line_delay_s, q = context.camera.line_delay_s, sync_settings.search_samples
+    period_s, numbers = _period_s(frames), np.array([frame.index - frames[0].index for frame in frames])
     for screen in distinct_screens(context.screens):
         each = (replace(context, cache=FrameCache(frame, context.timer)) for frame in frames)
         profiles = [of_frame.sample_columns(screen.columns) for of_frame in each]
         readout_s, variants = profiles[0].rows.size * line_delay_s, variants_of(screen, context.screens)
+        power, first_slot = _header_power(profiles, 1 / (screen.slot_rate_hz * line_delay_s))
         for stretch in range(1, min(sync_settings.max_stretch, max(int(period_s / readout_s), 1)) + 1):
-            frame_s = period_s / stretch
-            starts = (numbers - numbers[0]) * frame_s / line_delay_s
-            joined = _one_after_the_other(profiles, starts, screen.packet_s / line_delay_s)
-            slot, lead, log_evidence = _first_header(joined, screen, 1 / (screen.slot_rate_hz * line_delay_s))
+            period = period_s / stretch * screen.slot_rate_hz
+            starts = np.round(numbers[:, None] * period * q).astype(np.int64)
+            place, lead, log_evidence = _first_header(power, starts, screen.packet_slots * q)
             time = LinkTime(screen.packet_slots, screen.slot_rate_hz, stretch)
-            time.begin(frames[0].index, frames[0].time_s, -slot, frame_s * screen.slot_rate_hz)
+            time.begin(frames[0].index, frames[0].time_s, -(first_slot + place / q), period)
             log_evidence -= sync_settings.settled_llr * (stretch > 1)
             yield Start(screen, variants, time, lead, log_evidence)
 
 
-def _first_header(profiles: RowProfiles, screen: ScreenProfile, rows_per_slot: float) -> tuple[float, float, float]:
-    """Slots from sensor row 0 to the first header, how much likelier that place is, and the log-likelihood of headers.
+def _header_power(profiles: Sequence[RowProfiles], rows_per_slot: float) -> tuple[FloatArray, float]:
+    """(frames, samples) log-likelihood of a header that starts at each sample of a frame, and slot of the first sample.
 
-    Payloads of many columns add up to noise, against which every header that is in view counts.
+    Samples begin a header before the frame, so that a header that began before it counts by its end. Payloads of many
+    columns add up to noise, against which every header that is in view counts.
     """
-    q, top = sync_settings.search_samples, float(profiles.rows[0]) - 0.5
-    step = rows_per_slot / q
-    light, valid = sync.resample(profiles, top, step, int(profiles.rows.size / step))
-    pooled, weight = sync.search_contrast(light, valid, noise_of(profiles) / np.sqrt(max(step, 1.0)))
+    q, before = sync_settings.search_samples, SLOTS_PER_SYMBOL
+    spans, step = [sync.row_span(each) for each in profiles], rows_per_slot / q
+    top, bottom = min(top for top, _ in spans), max(bottom for _, bottom in spans)
+    n_samples = before * q + int((bottom - top) / step)
+    sampled = [sync.resample(each, top - before * rows_per_slot, step, n_samples) for each in profiles]
+    light, valid = (np.concatenate(values, axis=2) for values in zip(*sampled, strict=True))
+    pooled, weight = sync.search_contrast(light, valid, noise_of(profiles[0]) / np.sqrt(max(step, 1.0)))
     response = sync.header_response(pooled, weight, q).mean(axis=0)
     shown = response[response != 0]
     noise = np.square(np.median(np.abs(shown)) / NORMAL_MEDIAN) + TINY if shown.size else 1.0
-    power = folded(np.maximum(response, 0) ** 2 / (2 * noise), screen.packet_slots * q)
-    # Time stamps are rounded to milliseconds: neighbouring places are equivalent.
-    near = (power + np.roll(power, 1) + np.roll(power, -1)) / 3
-    place, lead = sync.header_comb(near, q)
-    best = float(near.max())
-    log_evidence = best + float(np.log(np.exp(near - best).sum() / near.size))
-    return top / rows_per_slot + place / q, lead, log_evidence
+    power = np.maximum(response, 0) ** 2 / (2 * noise)
+    return power.reshape(len(profiles), -1), top / rows_per_slot - before
 
 
-def _one_after_the_other(profiles: Sequence[RowProfiles], starts: FloatArray, packet_rows: float) -> RowProfiles:
-    """Row profiles of several frames as those of one picture, whose light is steady between them.
+def _first_header(power: FloatArray, starts: IntArray, period: int) -> tuple[float, float, float]:
+    """Sample of the first header, how much likelier that place is, and the log-likelihood of headers there.
 
     Args:
-        profiles: of each frame, all on the same rows.
-        starts: (n,) row of each frame's start, counted from that of the first frame.
-        packet_rows: length of a packet; a pause between two frames is known, and matters, up to whole packets.
+        power: (frames, samples), see `_header_power`.
+        starts: (frames, 1) samples from the start of the first frame to that of each.
+        period: samples of a packet.
     """
-    picture = profiles[0]
-    # Sensor rows of a frame that reach beyond its picture rows must not reach into the next frame.
-    light, inside, shifts, end = [picture.light], [picture.inside], [0], picture.rows.size
-    overhang = 0.0 if picture.sensor_row is None else float(np.ptp(picture.sensor_row - picture.rows))
-    for following, start in zip(profiles[1:], starts[1:], strict=True):
-        pause = int(np.round((start - end - overhang) % packet_rows + overhang))
-        light += [np.repeat(following.light[..., :1], pause, axis=2), following.light]
-        inside += [np.zeros((*following.inside.shape[:2], pause), bool), following.inside]
-        shifts.append(end + pause)
-        end += pause + following.rows.size
-    rows, sensor_row = picture.rows[0] + np.arange(end), picture.sensor_row
-    if sensor_row is not None:
-        shown = np.concatenate([picture.rows + shift for shift in shifts])
-        joined = np.concatenate([sensor_row + shift for shift in shifts], axis=2)
-        sensor_row = np.apply_along_axis(lambda strip: np.interp(rows, shown, strip), 2, joined)
-    light_of_all, inside_of_all = np.concatenate(light, axis=2), np.concatenate(inside, axis=2)
-    return replace(picture, light=light_of_all, inside=inside_of_all, rows=rows, sensor_row=sensor_row)
+    places = (starts + np.arange(power.shape[1])) % period
+    total = np.bincount(places.ravel(), power.ravel(), period)
+    # Time stamps are rounded to milliseconds: neighbouring places are equivalent.
+    near = (total + np.roll(total, 1) + np.roll(total, -1)) / 3
+    place, lead = sync.header_comb(near, sync_settings.search_samples)
+    best = float(near.max())
+    return place, lead, best + float(np.log(np.exp(near - best).sum() / near.size))
 
 
 def acquisition_at(start: Start, context: FrameContext) -> Acquisition | None:

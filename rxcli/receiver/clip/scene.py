@@ -80,10 +80,9 @@ class TrackedScreen:
         #: Of a pixel.
         self._noise = NoiseModel(noise_floor, acquisition.profiles.noise_slope)
         self._tails, self._w_log_prob = model.tails[0], w_log_prob
-        self._crosstalk = self._crosstalk_at(0.0)
         #: Where the screen is, and where the strips are read; the picture is known on the rows where it was first.
         self._place = ScreenPlace.at(corners, acquisition.screen.columns, self._lens, film_log_odds)
-        self.pose = self._first_pose = Pose(corners, corners, strips, strips)
+        self.pose = self._first_pose = Pose(corners, corners, strips, strips, self._crosstalk_at(0.0))
         #: The frame that was received last.
         self.last: View | None = None
         self._texture = ScreenTexture(frame, corners, self._lens)
@@ -156,7 +155,7 @@ class TrackedScreen:
         """Receive a frame with the screen at its current pose."""
         pose, frame, timer = self.pose, cache.frame, cache.timer
         with timer("sampling"):
-            light, picture = self._scaled(self.strips(frame)), self._placed(pose)
+            light, picture = self._scaled(self.strips(frame)), _placed(self._picture, pose)
             own_clock = last.acquisition.clock
             likely = picture.adapted(light, None, own_clock.rows_per_slot) if self._changes else picture
             columns = likely.solve(light)
@@ -361,7 +360,7 @@ class TrackedScreen:
         rows = clock.rows_per_slot / STILL.coarse_samples
         noise = self._noise.of_mean(self._first_pose.map.pixels * rows)
         exposure = Exposure.of(clock.exposure_slots, STILL.coarse_samples)
-        return ObservationModel(self._black_level, noise, self._crosstalk, exposure)
+        return ObservationModel(self._black_level, noise, self._first_pose.crosstalk, exposure)
 
     def _scaled(self, light: Float32Array) -> Float32Array:
         """Light (C, S, R) of the strips at the exposure of the picture; a step of it shows in all columns."""
@@ -422,7 +421,7 @@ class TrackedScreen:
             strips.rows, self._middles(found.corners, shift), self._middles(self._first_pose.picture, shift)
         )
         row = picture_row - np.float32(home.first_row)
-        self.pose = Pose(read, found.corners, strips, home, row, offset, shift, self._crosstalk_at(offset))
+        self.pose = Pose(read, found.corners, strips, home, self._crosstalk_at(offset), row, offset, shift)
 
     def _outlines(self, frame: Frame, corners: FloatArray) -> Outlines:
         n_columns = self._acquisition.screen.columns
@@ -444,15 +443,10 @@ class TrackedScreen:
         strips = self._first_pose.map
         return known_picture.KnownPicture(
             strips.inside.shape,
-            self._crosstalk,
             self._black_level,
             self._noise.of_mean(strips.pixels),
             self._acquisition.clock.exposure_slots,
         )
-
-    def _placed(self, pose: Pose) -> PlacedPicture:
-        """The picture on the rows of a pose."""
-        return self._picture.placed(pose.map.inside, pose.picture_row, pose.shift, pose.crosstalk)
 
     def update(self, view: View, lit: Callable[[], Float32Array]) -> None:
         """Set the frame that was received last; learn from the first frames, some later ones, and all of a film.
@@ -487,7 +481,7 @@ class TrackedScreen:
                 self._middles(pose.picture, pose.shift),
             ) - np.float32(pose.map.first_row)
         observation = known_picture.Observation(
-            view.light, slots, trust, pose.map.inside, frame_row, pose.shift, pose.crosstalk
+            view.light, slots, trust, pose.map.inside, pose.crosstalk, frame_row, pose.shift
         )
         return self._picture.learn(observation, forget=forget)
 
@@ -515,7 +509,7 @@ class TrackedScreen:
         assert view.light is not None
         assert view.pose is not None
         pose, clock = view.pose, view.clock
-        picture = self._picture.without(own).placed(pose.map.inside, pose.picture_row, pose.shift, pose.crosstalk)
+        picture = _placed(self._picture.without(own), pose)
         if view.joint is not None:
             acquisition = self._acquired(view.light, pose, picture, clock)
             known_better, _ = detect_jointly(acquisition, self._model(clock), view.joint.posteriors.w_log_prob, known)
@@ -569,6 +563,10 @@ class _Measured:
             for name in ("llr", "snr", "expected", "information")
         }
         return replace(self, **fields)
+
+
+def _placed(picture: known_picture.KnownPicture, pose: Pose) -> PlacedPicture:
+    return picture.placed(pose.map.inside, pose.crosstalk, pose.picture_row, pose.shift)
 
 
 def by_copy_llr(lit: Float32Array) -> Float32Array:

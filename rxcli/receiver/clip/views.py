@@ -24,13 +24,14 @@ class Pose:
     map: tracked.StripMap
     #: The strips on whose rows the picture is known.
     home: tracked.StripMap
+    #: Of the strips where they are read.
+    crosstalk: Crosstalk
     #: (C, R) row of the known picture at each row of the frame; None where the screen is where it was first.
     picture_row: Float32Array | None = None
-    #: Columns by which the strips lie to the right of their places, whole strips by which the picture has moved to the
-    #: right on the screen, and crosstalk of the strips there.
+    #: Columns by which the strips lie to the right of their places, and whole strips by which the picture has moved to
+    #: the right on the screen.
     offset: float = 0.0
     shift: int = 0
-    crosstalk: Crosstalk | None = None
 
     @property
     def rows(self) -> FloatArray:

@@ -39,11 +39,12 @@ class Observation:
     trust: Float32Array
     #: (C, S, R) bool: the strip is on the screen.
     inside: BoolArray
+    #: Of the strips.
+    crosstalk: Crosstalk
     #: (C, P) frame row of each picture row; None if unchanged since the first frame.
     frame_row: Float32Array | None = None
-    #: Strips by which the picture has moved to the right on the screen, and crosstalk; None: as at first.
+    #: Strips by which the picture has moved to the right on the screen.
     shift: int = 0
-    crosstalk: Crosstalk | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +61,6 @@ class KnownPicture:
 
     Args:
         shape: columns, strips of a column, and rows.
-        crosstalk: crosstalk of the strips.
         black_level: light of a dark slot.
         noise: noise of a strip's light.
         exposure_slots: exposure in slots; a wrong slot changes a row's light by its share of them.
@@ -69,12 +69,10 @@ class KnownPicture:
     def __init__(
         self,
         shape: tuple[int, ...],
-        crosstalk: Crosstalk,
         black_level: float,
         noise: NoiseModel,
         exposure_slots: float = 1.0,
     ) -> None:
-        self._crosstalk = crosstalk.shares.astype(np.float32)
         self._black_level = np.float32(black_level)
         self._noise = noise
         self._exposure_slots = max(exposure_slots, 1.0)
@@ -91,26 +89,27 @@ class KnownPicture:
     def placed(
         self,
         inside: BoolArray,
+        crosstalk: Crosstalk,
         picture_row: Float32Array | None = None,
         shift: int = 0,
-        crosstalk: Crosstalk | None = None,
     ) -> PlacedPicture:
         """The picture on the rows of a frame.
 
         Args:
             inside: (C, S, R) the strip is on the screen.
+            crosstalk: of the strips.
             picture_row: (C, R) row of the picture at each row of the frame; None if they are the same.
             shift: strips by which the picture has moved to the right on the screen.
-            crosstalk: of the strips there; None: as at first.
         """
         if self._placed is None or self._placed[0] is not inside:
             self._move(shift)
             picture, variance = self.picture()
             if picture_row is not None:
                 picture, variance = (_resampled(values, picture_row, beyond=False) for values in (picture, variance))
-            shares = self._crosstalk if crosstalk is None else crosstalk.shares.astype(np.float32)
             excess = self.excess, self.adapted_excess
-            on_frame = PlacedPicture(picture, variance, inside, shares, self._black_level, *excess)
+            on_frame = PlacedPicture(
+                picture, variance, inside, crosstalk.shares.astype(np.float32), self._black_level, *excess
+            )
             self._placed = inside, on_frame
         return self._placed[1]
 
@@ -149,8 +148,7 @@ class KnownPicture:
         Light and predicted light of a picture of 1, each weighted by the latter; predicted and measured mean light, as
         half of the slots are lit.
         """
-        shares = self._crosstalk if observation.crosstalk is None else observation.crosstalk.shares.astype(np.float32)
-        expected = shares @ _with_neighbours(observation.slots)
+        expected = observation.crosstalk.shares.astype(np.float32) @ _with_neighbours(observation.slots)
         inside, row = observation.inside.astype(np.float32), observation.frame_row
         # If little light was predicted, the observed light may come from other slots.
         power = expected * expected
