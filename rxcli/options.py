@@ -15,7 +15,7 @@ from rxcli.types import FILE_MEMORY_MB, Denoiser, FloatArray
 
 CaeMode = Literal["auto", "always", "never"]
 #: Names of shortcuts for `ReceiverOptions.skip`; the report counts each use.
-SKIPS = ("no_screen", "no_packets", "dark_columns", "certain_columns", "tracking")
+SKIPS = ("no_screen", "unlikely", "no_packets", "dark_columns", "certain_columns", "tracking")
 #: Instead of a profile's name: try all known profiles and let the picture decide.
 AUTO = "auto"
 _Profile = TypeVar("_Profile", ScreenProfile, CameraProfile)

@@ -420,7 +420,9 @@ class PacketResult:
 _OfPicture = Literal["black", "saturated", "few_pixels", "too_tall", "no_columns", "lit", "no_columns_dark"]
 _OfOutline = Literal["no_columns_striped", "corners_far", "corners_outside", "corners_few_rows"]
 _OfStripes = Literal["no_stripes", "part_striped", "narrow_stripes", "no_stripes_across", "long_exposure"]
-_OfLight = Literal["steady_light", "one_lamp", "screen_dark", "nothing_lit", "unsure", "no_column", "not_searched"]
+_OfLight = Literal[
+    "steady_light", "one_lamp", "screen_dark", "nothing_lit", "unsure", "no_column", "not_searched", "not_tried"
+]
 _OfPackets = Literal["no_headers", "no_header", "part_in_view", "screen_fills_little", "packet_too_long"]
 _OfColumn = Literal["headerless", "echo", "out_of_view", "goes_on", "withheld", "incomplete", "dark", "uncertain"]
 _OfNumbers = Literal["not_read", "column_numbers", "one_column", "column_alone", "all_the_same", "one_screen_tried"]
@@ -559,7 +561,7 @@ class SearchStep:
     evidence: float
     score: float
     #: "won"; "lost"; "half": its middle columns left it too far behind for a whole pass; "no clock"; "no data": it
-    #: scored best, but light without data explains it.
+    #: scored best, but light without data explains it; "not tried": the work for a picture without evidence was done.
     fate: str
 
 

@@ -62,7 +62,9 @@ def _finite(context: click.Context, parameter: click.Parameter, value: Any) -> A
 _SCREEN_HELP = "Screen profile; may be given several times. [default: auto, the one whose clock fits best]"
 _CAMERA_HELP = "Camera profile; of several, each file takes the one that fits it. [default: auto, all that are known]"
 _CORNERS_HELP = "The screen's corners in stored pixels, top-left first, clockwise as a viewer sees the screen."
-_SKIP_HELP = "Switch off a shortcut: no_screen, no_packets, dark_columns, certain_columns or tracking; several times."
+_SKIP_HELP = (
+    "Switch off a shortcut: no_screen, unlikely, no_packets, dark_columns, certain_columns or tracking; several times."
+)
 _MEMORY_HELP = "Memory for the files that are being received; the least complete are dropped."
 #: What `receiver_options` takes.
 receiver_arguments = options(

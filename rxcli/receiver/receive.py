@@ -18,21 +18,20 @@ from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.in_common import named
 from rxcli.receiver.frame.passes import Reception, headerless, soft_bits
-from rxcli.receiver.frame.result import Failure, Received, failed
-from rxcli.receiver.plane import in_one_mix
+from rxcli.receiver.frame.result import Failure, Received, failed, is_received
+from rxcli.receiver.plane import in_one_mix, orientation
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, search
-from rxcli.receiver.search.attempts import receive_either_way
 from rxcli.receiver.search.cameras import UNKNOWN, known_camera
 from rxcli.receiver.search.cut import cut_packets
 from rxcli.receiver.search.evidence import USUAL_COLUMNS
 from rxcli.receiver.search.framing import framing_of
-from rxcli.receiver.search.outlines import no_screen, proposed_screens, too_small
+from rxcli.receiver.search.outlines import may_be_turned, no_screen, proposed_screens, too_small
 from rxcli.receiver.search.propose import nearest_screen
-from rxcli.receiver.search.refusal import ruled_out
+from rxcli.receiver.search.refusal import likeliest_reason, other_than_stated, ruled_out
 from rxcli.receiver.still import apply_autoencoder, decode_photograph
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import Frame, FrameResult, FrameSoftBits, OnTaps, Remark
+from rxcli.types import Frame, FrameResult, FrameSoftBits, OnTaps, Reason, Remark
 
 
 def receive(frames: Iterable[Frame], options: ReceiverOptions, on_taps: OnTaps | None = None) -> Iterator[FrameResult]:
@@ -85,11 +84,14 @@ def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None
         return replace(result, remarks=(reason, Remark("not_searched")))
     with one_blas_thread():
         cache = cache.in_blinking_colours()
-        received = receive_either_way(cache, _in_total_order(options), _receive_still)
+        received = _receive_either_way(cache, _in_total_order(options))
         soft = _with_cut_packets(cache, received, _in_total_order(options))
     result = _without_unlikely_screen(received.result, soft)
-    remarks = _with_part_in_view(result.remarks, soft)
-    received = received._replace(result=replace(result, soft_bits=soft, remarks=remarks))
+    remarks, skipped = _with_part_in_view(result.remarks, soft), result.skipped
+    n_left = sum(step.fate == "not tried" for step in result.search)
+    if n_left and not received.n_believable:
+        remarks, skipped = (*remarks, Remark("not_tried", {"n": n_left})), {**skipped, "unlikely": n_left}
+    received = received._replace(result=replace(result, soft_bits=soft, remarks=remarks, skipped=skipped))
     if on_taps is not None and received.taps:
         on_taps(frame.source, frame.index, received.taps)
     claims = ", ".join(frame.metadata.not_believed) if received.result.packets else ""
@@ -103,32 +105,70 @@ def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None
     return replace(result, mirrored=None if frame.metadata.names_front_camera else False)
 
 
-def _receive_still(cache: FrameCache, options: ReceiverOptions, least: float) -> Received:
-    """Receive every screen in a frame with more than `least` evidence; the one with the most packets comes first."""
+def _receive_either_way(cache: FrameCache, options: ReceiverOptions) -> Received:
+    """Receive a frame as it is stored; without packets, also turned by 90 degrees if its columns lie along its rows."""
+    frame, asks_for_turn = cache.frame, cache.frame.metadata.orientation in orientation.PORTRAIT
+    upright = cache.with_metadata(replace(frame.metadata, orientation=1)) if asks_for_turn else cache
+    received = _receive_still(upright, options)
+    if received.n_believable:
+        reason: Reason = "upside_down" if _is_reversed(received.result) else "as_stored"
+        return received.with_remark(Remark(reason) if reason == "upside_down" or asks_for_turn else None)
+    if options.corners is not None or received.result.reason == "steady_light":
+        return received
+    attempts = []
+    for quarter_turns in orientation.QUARTER_TURNS if may_be_turned(upright, options) else ():
+        back = orientation.turned_frame(frame, quarter_turns)
+        attempt = _receive_still(FrameCache(back, cache.timer).in_blinking_colours(), options)
+        result = orientation.as_stored(back, attempt.result, quarter_turns)
+        if not _gives_few(result):
+            rank = not _is_reversed(result), attempt.n_believable, quarter_turns
+            attempts.append((rank, attempt._replace(result=result)))
+    if attempts:
+        (*_, quarter_turns), best = max(attempts, key=lambda attempt: attempt[0])
+        return best.with_remark(Remark("turned_counterclockwise" if quarter_turns == 1 else "turned_clockwise"))
+    remarks = likeliest_reason(cache, received.result, options)
+    if remarks and remarks[0].reason in ("portrait", "on_its_side"):
+        # Packets that are not believable are none then.
+        nothing = FrameResult(frame.source, frame.index, frame.time_s, "ok")
+        return Received(failed(nothing, Failure(remarks[0], "no_screen")), {})
+    return received.with_remarks(*remarks)
+
+
+def _is_reversed(result: FrameResult) -> bool:
+    return result.estimated.get("readout_reversed", (0.0, 0.0))[0] > 0
+
+
+def _gives_few(result: FrameResult) -> bool:
+    """Whether less than half of the lit columns gave a packet."""
+    lit = [column for column in result.columns if column.status != "dark"]
+    n_received = sum(any(is_received(packet, result) for packet in column.packets) for column in lit)
+    return 2 * n_received < max(len(lit), 1)
+
+
+def _receive_still(cache: FrameCache, options: ReceiverOptions) -> Received:
+    """Receive every screen in a frame; the one with the most packets comes first."""
     nothing = FrameResult(cache.frame.source, cache.frame.index, cache.frame.time_s, "ok")
     screens = proposed_screens(cache, options)
     if isinstance(screens, Failure):
         return Received(failed(nothing, screens), {})
-    received = [_receive_screen(nothing, cache, outlines, options, least) for outlines in screens]
+    received = [_receive_screen(nothing, cache, outlines, options) for outlines in screens]
     clearest = received[0].result
     if not screens[0][0].stands_out and not clearest.packets and clearest.reason != "steady_light":
-        return Received(failed(nothing, no_screen(cache)), {})
+        return Received(replace(failed(nothing, no_screen(cache)), search=clearest.search), {})
     best, *less = sorted(received, key=lambda screen: -screen.n_believable)
     other_screens = tuple(screen.result for screen in less if screen.result.packets)
     return best._replace(result=replace(best.result, other_screens=other_screens))
 
 
 def _receive_screen(
-    nothing: FrameResult, cache: FrameCache, outlines: list[Outline], options: ReceiverOptions, least: float
+    nothing: FrameResult, cache: FrameCache, outlines: list[Outline], options: ReceiverOptions
 ) -> Received:
-    """Receive one screen with more than `least` evidence; `nothing` is the result without any."""
+    """Receive one screen; `nothing` is the result without any."""
     frame, timer = cache.frame, cache.timer
     # Search: where the columns are, what a row is in time, which screen and clock.
-    found = search(cache, options, outlines=outlines, least=least)
+    found = search(cache, options, outlines=outlines, may_doubt=True)
     if isinstance(found, Failure):
         return Received(failed(nothing, found), {})
-    if found.best.evidence <= least:
-        return Received(replace(nothing, search=tuple(tried.step for tried in found.tried)), {})
     outline, context, acquisition = found.outline, found.best.context, found.best.acquisition
     camera = context.camera
     # Channel and decode, in turn: slots to symbols, and symbols to the picture.
@@ -169,7 +209,8 @@ def _receive_screen(
         leftmost = next((column.column for column in columns if column.packets), 0)
         facts = {"column": leftmost, "certainty": outline.certainty}
         result = replace(result, remarks=(Remark("column_numbers", facts),))
-    return Received(result, _taps(found, reception))
+    received = Received(result, _taps(found, reception))
+    return received.with_remark(other_than_stated(cache.frame, options, found, received))
 
 
 def _with_cut_packets(cache: FrameCache, received: Received, options: ReceiverOptions) -> FrameSoftBits | None:

@@ -160,15 +160,18 @@ def _at_likeliest_phase(context: FrameContext) -> Iterator[_Slots]:
     )
     n, step = SETTINGS.cut_phases, rows_per_slot / SETTINGS.cut_phases
     acquisition = Acquisition(screen, profiles, clock, (screen,))
-    clocks = [replace(clock, row0=top - part * step) for part in range(n)]
-    evidence_of = [log_evidence for _, log_evidence in slots_of_any_kind(acquisition, clocks)]
-    if np.ptp(evidence_of) < SETTINGS.cut_lead * n_slots:
+    # The brighter half of the columns shows the phase as well.
+    bright = acquisition.of_columns(acquisition.bright_columns)
+    clocks = [replace(bright.clock, row0=top - part * step) for part in range(n)]
+    evidence_of = [log_evidence for _, log_evidence in slots_of_any_kind(bright, clocks)]
+    lead = float(np.ptp(evidence_of)) / n_slots
+    if lead < SETTINGS.cut_lead:
         return
     best = int(np.argmax(evidence_of))
     beside = peak_offset(*np.take(evidence_of, [best - 1, best, best + 1], mode="wrap"))
-    clock = replace(clocks[best], row0=clocks[best].row0 - float(np.clip(beside, -0.5, 0.5)) * step)
+    clock = replace(clock, row0=clocks[best].row0 - float(np.clip(beside, -0.5, 0.5)) * step)
     ((lit, log_evidence),) = slots_of_any_kind(acquisition, [clock])
-    lead, lit = (log_evidence - min(evidence_of)) / n_slots, clock.on_grid(lit[None])
+    lit, lead = clock.on_grid(lit[None]), lead * screen.columns / bright.clock.delay_slots.size
     yield _Slots(context, replace(acquisition, clock=clock), lit, log_evidence, lead, context.screens)
 
 

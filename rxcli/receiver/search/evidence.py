@@ -6,6 +6,7 @@ from rxcli.numerics import TINY
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.search.hypothesis import Scored
 from rxcli.receiver.search.settings import SETTINGS
+from rxcli.types import BELIEVABLE, BoolArray
 
 #: Columns of most screens. Evidence is scaled to them: narrower columns show the same light several times.
 USUAL_COLUMNS = 20
@@ -25,6 +26,11 @@ def fit(reception: Reception) -> float:
     """How well packets fit, for clocks whose slots are the same: in poor light all columns together show the start."""
     llr = reception.posteriors.log_evidence
     return USUAL_COLUMNS / llr.size * float(np.maximum(llr, -SETTINGS.cut_start).sum())
+
+
+def believable(reception: Reception) -> BoolArray:
+    """(B, C) complete packets that are believable, whatever their column's number."""
+    return reception.is_complete & (reception.packet_confidence >= BELIEVABLE)
 
 
 def score(reception: Reception, evidence: float, log_prior: float) -> float:

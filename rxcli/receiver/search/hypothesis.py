@@ -22,6 +22,8 @@ class Hypothesis:
     #: The screen and others that differ only in the number of copies per burst, largest number first.
     variants: tuple[ScreenProfile, ...]
     log_prior: float
+    #: Number of the way to look at the picture that it belongs to, see `propose.ways`.
+    way: int = 0
     clock: Clock | None = None
     profiles: RowProfiles | None = field(default=None, repr=False, compare=False)
 
@@ -30,8 +32,10 @@ class Hypothesis:
         """Equal for hypotheses that an initial pass cannot distinguish; also the order of ties."""
         estimate = self.camera.hypothesis
         return (
+            self.way,
             self.outline.family,
             estimate.number if estimate else 0,
+            self.camera.reversed,
             self.screen.packet_slots,
             self.screen.columns,
             self.screen.slot_rate_hz,
@@ -86,3 +90,6 @@ class Found:
     tried: tuple[Tried, ...]
     #: All screens that the camera may have seen.
     screens: tuple[ScreenProfile, ...]
+    #: Whether the camera is not as profile or file state it; the best that is, if any.
+    doubts: bool = False
+    stated: Scored | None = None

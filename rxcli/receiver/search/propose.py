@@ -24,9 +24,13 @@ from rxcli.receiver.search.cameras import (
 )
 from rxcli.receiver.search.evidence import USUAL_COLUMNS
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
+from rxcli.receiver.search.outlines import without_borders
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Clock, Remark, RowProfiles
+
+#: Relative difference of line delays up to which an estimate agrees with a profile.
+_SAME_LINE_DELAY = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,14 +50,17 @@ class Proposer:
     outlines: tuple[Outline, ...]
     known: FrameContext | None = None
     may_bend: bool = True
+    #: Number of this way among the `ways` to look at the picture, and its log prior.
+    way: int = 0
+    log_prior: float = 0.0
+    #: Whether it doubts what profile or file state of the camera; outlines of the light that shows an unknown camera,
+    #: if these are others.
+    doubts: bool = False
+    lit: tuple[Outline, ...] = ()
 
     def families(self) -> list[Outline]:
         """One outline of every family, likeliest first: packets are the same whichever column is the first."""
-        families: dict[int, list[Outline]] = {}
-        for outline in self.outlines:
-            families.setdefault(outline.family, []).append(outline)
-        chosen = [likeliest_of_family(outlines) for outlines in families.values()]
-        return sorted(chosen, key=lambda outline: (-outline.log_odds, outline.family))
+        return _families(self.outlines)
 
     def cameras(self) -> Generator[list[Hypothesis], None, Remark | None]:
         """Hypotheses camera by camera, the likeliest camera first; returns the reason why there are none, or no more.
@@ -64,15 +71,15 @@ class Proposer:
         if isinstance(known, Failure):
             return known.remark
         if known is not None:
-            yield self._of_camera(known, 0.0)
+            yield self._of_camera(known, self.log_prior)
             return None
         reason, n_proposed = None, 0
         usual = nearest_screen(self.options.screens, USUAL_COLUMNS).columns
-        for outline in self.families():
+        for outline in _families(self.lit or self.outlines):
             cameras = propose_cameras(self.cache, outline.corners, self.options, usual, may_bend=self.may_bend)
             try:
                 while True:
-                    if hypotheses := self._of_camera(next(cameras), -SETTINGS.next_camera * n_proposed):
+                    if hypotheses := self._of_camera(next(cameras), self.log_prior - SETTINGS.next_camera * n_proposed):
                         yield hypotheses
                         n_proposed += 1
             except StopIteration as end:
@@ -104,7 +111,7 @@ class Proposer:
     def _hypothesis(self, outline: Outline, camera: FrameCamera, screen: ScreenProfile, log_prior: float) -> Hypothesis:
         variants = variants_of(screen, self.options.screens)
         camera = relabelled_camera(camera, screen, self.cache.frame)
-        return Hypothesis(outline, camera, variants[0], variants, log_prior)
+        return Hypothesis(outline, camera, variants[0], variants, log_prior, self.way)
 
     def context(self, hypothesis: Hypothesis) -> FrameContext:
         """The frame under a hypothesis, with the screens that its camera allows."""
@@ -132,6 +139,29 @@ class Proposer:
             return None
         return replace(hypothesis, clock=clock, profiles=without_steady_light(profiles, clock))
 
+    def contradicts(self, scored: Scored) -> bool:
+        """Whether an estimate is not the camera that is stated, or its exposure that of a screen of another rate.
+
+        Under a screen that is not the one in the picture, an estimate may fit what profile and file rule out.
+        """
+        frame, camera, own = self.cache.frame, scored.context.camera, scored.hypothesis.screen.slot_rate_hz
+        known, stated_s = known_camera(frame, self.options), frame.metadata.exposure_s
+        if isinstance(known, FrameCamera) and abs(camera.line_delay_s / known.line_delay_s - 1) > _SAME_LINE_DELAY:
+            return True
+        if not stated_s:
+            return False
+        off = {
+            rate: abs(np.log(camera.exposure_s * own / (stated_s * rate)))
+            for rate in (s.slot_rate_hz for s in self.options.screens)
+        }
+        return min(off, key=off.__getitem__) != own
+
+    def work(self, hypothesis: Hypothesis) -> int:
+        """Slots x columns in view, which the search for a clock goes through; see `SearchSettings.work`."""
+        shown = np.ptp(np.clip(hypothesis.outline.corners[:, 1], 0, self.cache.frame.height))
+        screen = hypothesis.screen
+        return int(shown * hypothesis.camera.line_delay_s * screen.slot_rate_hz * screen.columns)
+
     def siblings(self, scored: Scored) -> Iterator[Hypothesis]:
         """Hypotheses that differ from a scored one in one respect, with their changed log prior."""
         hypothesis = replace(scored.hypothesis, camera=scored.context.camera, clock=None, profiles=None)
@@ -144,7 +174,7 @@ class Proposer:
                 yield self._hypothesis(candidate, camera, nearest_screen(same_clock, n_columns), log_prior + change)
         if camera.hypothesis is not None and scored.reception.is_long and scored.evidence < SETTINGS.plain:
             # What long exposures leave of a packet fits either way to some extent.
-            other_way = replace(camera.hypothesis, reversed=not camera.reversed, number=-1 - camera.hypothesis.number)
+            other_way = replace(camera.hypothesis, reversed=not camera.reversed)
             back = estimated_camera(other_way, hypothesis.screen.slot_rate_hz, self.cache.frame)
             yield self._hypothesis(outline, back, hypothesis.screen, log_prior)
         by_clock = _by_clock(outline, camera, self.options.screens)
@@ -152,6 +182,51 @@ class Proposer:
         for columns, screen in by_columns.items():
             if columns != n_columns and scored.evidence < SETTINGS.plain:
                 yield self._hypothesis(outline, camera, screen, log_prior)
+
+
+def ways(
+    cache: FrameCache,
+    options: ReceiverOptions,
+    outlines: Sequence[Outline],
+    known: FrameContext | None = None,
+    *,
+    may_bend: bool = True,
+    may_doubt: bool = False,
+) -> Iterator[Proposer]:
+    """Ways to look at a picture, likeliest first: later ones are for pictures that the others do not explain.
+
+    Args:
+        cache: the picture.
+        options: screens and cameras.
+        outlines: that the screen may have.
+        known: see `Proposer`.
+        may_bend: see `Proposer`.
+        may_doubt: whether what profile and file state of the camera may be wrong.
+    """
+    stated = Proposer(cache, options, tuple(outlines), known, may_bend)
+    yield stated
+    less_likely = replace(stated, way=1, log_prior=-SETTINGS.reach)
+    if outlines[0].family >= 0 and not outlines[0].leans and (without := without_borders(cache)):
+        # Of one column that sends alone, its own rows give the camera, and given corners its number.
+        is_given = options.corners is not None
+        yield replace(less_likely, outlines=tuple(outlines if is_given else without), lit=tuple(without))
+    if not may_doubt:
+        return
+    frame, estimated = cache.frame, replace(options, cameras=(), force_camera=False)
+    doubtful = replace(less_likely, options=estimated, doubts=True)
+    if known_camera(frame, options) is not None:
+        yield replace(doubtful, way=2)
+    if frame.metadata.exposure_s is not None:
+        unstated = cache.with_metadata(replace(frame.metadata, exposure_s=None))
+        yield replace(doubtful, cache=unstated, way=3, log_prior=-2 * SETTINGS.reach)
+
+
+def _families(outlines: Sequence[Outline]) -> list[Outline]:
+    families: dict[int, list[Outline]] = {}
+    for outline in outlines:
+        families.setdefault(outline.family, []).append(outline)
+    chosen = [likeliest_of_family(family) for family in families.values()]
+    return sorted(chosen, key=lambda outline: (-outline.log_odds, outline.family))
 
 
 def likeliest_of_family(outlines: Sequence[Outline]) -> Outline:

@@ -3,6 +3,8 @@
 A periodic waveform or a single lamp may explain the light as well as packets do.
 """
 
+from typing import Any
+
 import numpy as np
 
 from rxcli.options import ReceiverOptions
@@ -13,18 +15,20 @@ from rxcli.receiver.frame.acquisition import noise_of
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception, dark_columns, shows_steady_light
-from rxcli.receiver.frame.result import Failure
+from rxcli.receiver.frame.result import Failure, Received
 from rxcli.receiver.frame.settings import SETTINGS as PASSES
 from rxcli.receiver.light import MAX_EXPOSURE_SLOTS
 from rxcli.receiver.plane.orientation import PORTRAIT
 from rxcli.receiver.screen.stripes import MIN_LEAN, common_stripes
-from rxcli.receiver.search.hypothesis import Hypothesis
+from rxcli.receiver.search import evidence
+from rxcli.receiver.search.cameras import known_camera
+from rxcli.receiver.search.hypothesis import Found, Hypothesis
 from rxcli.receiver.search.outlines import common_light, lean_of, too_small, useless
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import as_one_column
 from rxcli.receiver.sync import clock as sync
-from rxcli.types import BELIEVABLE, FrameResult, Remark, RowProfiles
+from rxcli.types import BELIEVABLE, Frame, FrameResult, Remark, RowProfiles
 
 #: Reasons that nothing makes likelier.
 _PLAIN = ("steady_light", "one_lamp", "black", "saturated", "few_pixels", "too_tall", "portrait")
@@ -70,6 +74,23 @@ def likeliest_reason(cache: FrameCache, result: FrameResult, options: ReceiverOp
         return (Remark("no_stripes_across"),)
     common = common_light(frame)
     return remarks if common is None else (common,)
+
+
+def other_than_stated(frame: Frame, options: ReceiverOptions, found: Found, received: Received) -> Remark | None:
+    """Remark on a result whose camera is not as it is stated: what was stated, and what was estimated."""
+    known, result = known_camera(frame, options), received.result
+    n_stated = 0 if found.stated is None else int(np.count_nonzero(evidence.believable(found.stated.reception)))
+    if not found.doubts or received.n_believable <= n_stated:
+        return None
+    if isinstance(known, Failure):
+        return known.remark
+    facts: dict[str, Any] = {"n_stated": n_stated, "n_estimated": received.n_believable}
+    facts |= {"stated_s": frame.metadata.exposure_s or 0.0, "exposure_s": result.exposure_s or 0.0}
+    if known is None:
+        return Remark("other_exposure", facts)
+    facts |= {"profile": known.profile, "profile_s": known.line_delay_s, "line_delay_s": result.line_delay_s or 0.0}
+    is_exposure = found.best.context.frame.metadata.exposure_s is None and frame.metadata.exposure_s is not None
+    return Remark("other_camera_and_exposure" if is_exposure else "other_camera", facts)
 
 
 def light_without_data(context: FrameContext, reception: Reception) -> Failure | None:

@@ -1,7 +1,7 @@
 """Best-first search: make an initial pass of the likeliest hypothesis; its score determines the next one."""
 
 import heapq
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from dataclasses import replace
 from itertools import count
 
@@ -9,10 +9,11 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.camera.settings import SETTINGS as camera_settings
+from rxcli.receiver.decode.settings import QUICK_SURVIVORS
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
-from rxcli.receiver.frame.passes import Reception
+from rxcli.receiver.frame.passes import Reception, dark_columns
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.frame.settings import SETTINGS as PASSES
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS
@@ -23,8 +24,8 @@ from rxcli.receiver.search import evidence
 from rxcli.receiver.search.cameras import settle
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
 from rxcli.receiver.search.numbers import less_likely_outlines, numbered
-from rxcli.receiver.search.outlines import proposed_screens, without_borders
-from rxcli.receiver.search.propose import Proposer
+from rxcli.receiver.search.outlines import proposed_screens
+from rxcli.receiver.search.propose import Proposer, ways
 from rxcli.receiver.search.refusal import light_without_data, why_no_packets
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import in_other_bursts, initial_pass
@@ -42,7 +43,7 @@ def search(
     *,
     outlines: list[Outline] | None = None,
     may_bend: bool = True,
-    least: float = 0.0,
+    may_doubt: bool = False,
 ) -> Found | Failure:
     """Find outline, rows, camera, screen, clock and bursts of a frame.
 
@@ -52,50 +53,16 @@ def search(
         known: context of a frame of the same camera, if the camera and the screens are known.
         outlines: of the screen to receive; those of the clearest one in the picture if left out.
         may_bend: whether an unknown camera may have taken a distortion out, so that stripes are bent.
-        least: evidence that a better hypothesis has to exceed.
+        may_doubt: whether what profile and file state of the camera may be wrong.
     """
     if outlines is None:
         screens = proposed_screens(cache, options)
         if isinstance(screens, Failure):
             return screens
         outlines = screens[0]
-    found = _search(cache, options, known, outlines, may_bend, least)
-    packets = _packet_evidence(found)
-    if outlines[0].family < 0 or (packets and outlines[0].stands_out) or outlines[0].leans:
-        return found
-    without = without_borders(cache)
-    if not without:
-        return found
-    borderless = _search(cache, options, known, without, may_bend, least)
-    if options.corners is not None:
-        if isinstance(borderless, Failure) or not _packet_evidence(borderless):
-            return found
-        # Of one column that sends alone, its own rows give the camera, and the corners its number.
-        numbered_by_corners = _search(cache, options, borderless.best.context, outlines, may_bend, least)
-        return numbered_by_corners if _packet_evidence(numbered_by_corners) else found
-    is_steady = isinstance(borderless, Failure) and borderless.reason == "steady_light" and not packets
-    return borderless if is_steady or _packet_evidence(borderless) > SETTINGS.borderless_gain * packets else found
-
-
-def _packet_evidence(found: Found | Failure) -> float:
-    """Evidence of what was found, or 0 if it shows no packets."""
-    if isinstance(found, Failure) or found.best.evidence < SETTINGS.few_packets:
-        return 0.0
-    return found.best.evidence
-
-
-def _search(
-    cache: FrameCache,
-    options: ReceiverOptions,
-    known: FrameContext | None,
-    outlines: list[Outline],
-    may_bend: bool,
-    least: float,
-) -> Found | Failure:
-    """`search` among outlines."""
-    proposer = Proposer(cache, options, tuple(outlines), known, may_bend)
-    is_doubtful = not outlines[0].stands_out and outlines[0].family >= 0
-    walk = _Walk(proposer, SETTINGS.doubtful_budget if is_doubtful else SETTINGS.budget, least)
+    walk = _Walk(
+        ways(cache, options, outlines, known, may_bend=may_bend, may_doubt=may_doubt), "unlikely" in options.skip
+    )
     best = walk.run()
     min_evidence = (
         PASSES.min_packets_llr if best is None or best.context.camera.hypothesis is None else SETTINGS.few_packets
@@ -103,15 +70,20 @@ def _search(
     if best is None or best.evidence < min_evidence:
         best = walk.best_without_packets()
     if best is None:
-        return replace(why_no_packets(proposer, walk.nearest, walk.reason), tried=walk.record(None))
+        return replace(walk.why_no_packets(), tried=walk.record(None))
+    proposer = walk.way_of(best.hypothesis)
+    outlines = list(proposer.outlines)
     if best.evidence >= SETTINGS.few_packets:
         outlines = less_likely_outlines(best, outlines, proposer)
     chosen = numbered(best.hypothesis.outline, outlines, walk.score_of)
     refused = light_without_data(best.context, best.reception)
+    if refused is not None and proposer.doubts:
+        return replace(walk.why_no_packets(), tried=walk.record(best, "no data"))
     if refused is not None:
         return replace(refused, outline=chosen, context=best.context, tried=walk.record(best, "no data"))
     chosen = replace(chosen, corners=_corners_by_slots(chosen, best))
-    return Found(best, chosen, walk.record(best), proposer.possible_screens(best.hypothesis))
+    possible = proposer.possible_screens(best.hypothesis)
+    return Found(best, chosen, walk.record(best), possible, proposer.doubts, walk.best_as_stated())
 
 
 def _corners_by_slots(outline: Outline, best: Scored) -> FloatArray:
@@ -130,54 +102,74 @@ def _corners_by_slots(outline: Outline, best: Scored) -> FloatArray:
 
 
 class _Walk:
-    """One search under way."""
+    """One search under way.
 
-    def __init__(self, proposer: Proposer, budget: int, least: float = 0.0) -> None:
-        self._proposer, self._budget, self._least = proposer, budget, least
+    Args:
+        possible: ways to look at the picture, likeliest first.
+        gives_up: whether to end when the work for a picture without evidence is done.
+    """
+
+    def __init__(self, possible: Iterable[Proposer], gives_up: bool = True) -> None:
+        self._possible, self._gives_up = iter(possible), gives_up
+        #: Ways that were begun.
+        self.ways: list[Proposer] = []
         self._scored: list[Scored] = []
         self._tried: list[Tried] = []
         self._asked: set[tuple[object, ...]] = set()
-        #: Long exposures that showed no packets, or less than the best hypothesis.
-        self._n_in_vain = 0
+        #: Work that is done, see `SearchSettings.work`.
+        self._work = 0
         self._number = count()
         self._fresh: list[_Entry] = []
         self._siblings: list[_Entry] = []
         #: None when there are no more; upper bound of the next one's log prior.
-        self._cameras: _Cameras | None = proposer.cameras()
+        self._cameras: _Cameras | None = None
         self._next_prior = np.inf
-        #: Reason why there are no cameras; and the first hypothesis.
-        self.reason: Remark | None = None
-        self.nearest: Hypothesis | None = None
+        #: Of each way, the reason why it has no more cameras, and its first hypothesis.
+        self._reasons: dict[int, Remark | None] = {}
+        self._nearest: dict[int, Hypothesis] = {}
 
     def run(self) -> Scored | None:
         """Score hypotheses, best first, until nothing is near the best or the budget is spent; returns the best."""
-        while len(self._tried) < self._budget and (entry := self._next()) is not None:
+        while (entry := self._next()) is not None:
             queue, (key, _, _, hypothesis) = entry
+            if self._is_spent():
+                left = (hypothesis, *(likely for _, _, _, likely in sorted(self._fresh)))
+                self._tried += [Tried(likely, 0.0, likely.log_prior, "not tried") for likely in left]
+                break
             if (hypothesis.identity, hypothesis.clock is None) in self._asked:
                 continue
             self._asked.add((hypothesis.identity, hypothesis.clock is None))
             if hypothesis.clock is None:
-                found = self._proposer.with_clock(hypothesis)
+                proposer = self.way_of(hypothesis)
+                found = proposer.with_clock(hypothesis)
+                self._work += proposer.work(hypothesis)
                 if found is None:
                     self._tried.append(Tried(hypothesis, 0.0, hypothesis.log_prior, "no clock"))
                 else:
                     self._push(queue, -key, found)
                 continue
             self._score(hypothesis)
-            if self._is_hopeless():
-                break
         return self._best()
+
+    def way_of(self, hypothesis: Hypothesis) -> Proposer:
+        """The way to look at the picture that a hypothesis belongs to."""
+        return next(way for way in self.ways if way.way == hypothesis.way)
+
+    def _is_spent(self, more: int = 0, found: float = 0.0) -> bool:
+        """Whether more work is more than the evidence allows: that so far, and that of a part of a hypothesis."""
+        best = self._best()
+        gain = max(best.evidence if best else 0.0, found) / SETTINGS.plain_estimate
+        return self._gives_up and self._work + more > SETTINGS.work * max(gain, 1.0)
 
     def _fitted(self, best: Scored) -> Scored:
         """The same with an estimated camera fitted to its slots until the clock no longer moves."""
+        proposer = self.way_of(best.hypothesis)
         for _ in range(camera_settings.max_fits if best.context.camera.hypothesis else 0):
-            camera, moved_slots = settle(
-                best.context, best.acquisition, best.reception, may_bend=self._proposer.may_bend
-            )
+            camera, moved_slots = settle(best.context, best.acquisition, best.reception, may_bend=proposer.may_bend)
             is_enough = best.evidence > SETTINGS.plain_estimate or best.reception.is_long
             if moved_slots < camera_settings.matters_slots and is_enough:
                 return best.with_camera(camera)
-            hypothesis = self._proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
+            hypothesis = proposer.with_clock(replace(best.hypothesis, camera=camera, clock=None))
             if hypothesis is None:
                 break
             fitted = replace(self._measured(hypothesis, _acquired(hypothesis)), hypothesis=best.hypothesis)
@@ -201,12 +193,26 @@ class _Walk:
         own = best and best.hypothesis.identity
         return tuple(replace(step, fate=fate) if step.hypothesis.identity == own else step for step in self._tried)
 
-    def _best(self) -> Scored | None:
-        return max(self._scored, key=lambda scored: scored.score, default=None)
+    def why_no_packets(self) -> Failure:
+        """Why no way to look at the picture as it is stated gave packets; light without borders may be a lamp's."""
+        stated = [way for way in self.ways if not way.doubts]
+        failures = [why_no_packets(w, self._nearest.get(w.way), self._reasons.get(w.way)) for w in stated]
+        return next((failure for failure in failures if failure.reason == "steady_light"), failures[0])
 
-    def _is_hopeless(self) -> bool:
-        passes = [step.evidence for step in self._tried if step.fate != "no clock"]
-        return len(passes) >= SETTINGS.hopeless_budget and max(passes) < PASSES.min_packets_llr
+    def best_as_stated(self) -> Scored | None:
+        """The best by what profile and file state of the camera."""
+        stated = (scored for scored in self._scored if not self.way_of(scored.hypothesis).doubts)
+        return max(stated, key=lambda scored: scored.score, default=None)
+
+    def _best(self) -> Scored | None:
+        """The best; a camera that contradicts what is stated counts from where wrong clocks do not reach."""
+        possible = (
+            scored
+            for scored in self._scored
+            if scored.evidence > SETTINGS.plain
+            or not (self.way_of(scored.hypothesis).doubts and self.ways[0].contradicts(scored))
+        )
+        return max(possible, key=lambda scored: scored.score, default=None)
 
     def _push(self, queue: list[_Entry], key: float, hypothesis: Hypothesis) -> None:
         heapq.heappush(queue, (-key, hypothesis.identity, next(self._number), hypothesis))
@@ -222,26 +228,46 @@ class _Walk:
             if is_near and not (is_doubtful and (self._fresh or self._cameras is not None)):
                 return self._siblings, heapq.heappop(self._siblings)
             # A long exposure that no file states explains the light of a short one to some extent.
-            is_open = is_estimated and best.reception.is_long and self._proposer.cache.frame.metadata.exposure_s is None
+            is_open = is_estimated and best.reception.is_long and best.context.frame.metadata.exposure_s is None
             # A wrong length of packets explains light to some extent, but gives none.
-            shows_packets = bool((best.reception.best_confidence() > SETTINGS.likely_certainty).any())
+            shows_packets = bool(evidence.believable(best.reception).any())
             is_plain = best.evidence > (SETTINGS.plain_estimate if is_estimated and shows_packets else SETTINGS.plain)
             if is_plain and not is_open:
+                self._cameras, self._fresh = None, []
+        while True:
+            self._propose()
+            if self._fresh:
+                return self._fresh, heapq.heappop(self._fresh)
+            way = None if best is not None and self._is_settled(best) else next(self._possible, None)
+            if way is None:
                 return None
+            self.ways.append(way)
+            self._cameras, self._next_prior = way.cameras(), np.inf
+
+    def _is_settled(self, best: Scored) -> bool:
+        """Whether no other way to look at the picture is worth the work."""
+        outline, reception = best.hypothesis.outline, best.reception
+        if best.evidence < SETTINGS.plain_estimate or best.evidence > SETTINGS.plain:
+            return best.evidence > SETTINGS.plain
+        n_received = int(np.count_nonzero(evidence.believable(reception).any(axis=0)))
+        is_clear = outline.stands_out and best.context.camera.hypothesis is not None and n_received > 0
+        return is_clear or n_received >= SETTINGS.settled_share * int(np.count_nonzero(~dark_columns(reception.snr)))
+
+    def _propose(self) -> None:
+        """Take cameras of the last way until the likeliest hypothesis that is left is among the fresh ones."""
         while self._cameras is not None and (not self._fresh or self._next_prior > -self._fresh[0][0]):
             try:
                 proposed = next(self._cameras)
             except StopIteration as end:
-                self._cameras, self.reason = None, end.value
+                self._cameras, self._reasons[self.ways[-1].way] = None, end.value
                 break
             if not proposed:
                 continue
             likeliest = min(proposed, key=lambda hypothesis: (-hypothesis.log_prior, hypothesis.identity))
-            self.nearest = self.nearest or likeliest
+            self._nearest.setdefault(likeliest.way, likeliest)
             self._next_prior = likeliest.log_prior - SETTINGS.next_camera
             for hypothesis in proposed:
                 self._push(self._fresh, hypothesis.log_prior, hypothesis)
-        return (self._fresh, heapq.heappop(self._fresh)) if self._fresh else None
 
     def _score(self, hypothesis: Hypothesis) -> None:
         """Make an initial pass; after a better hypothesis, and of a long exposure, of the bright columns first.
@@ -249,12 +275,13 @@ class _Walk:
         The others follow if the bright ones come near the best score; if that is beyond doubt, if they beat its own.
         """
         best, acquisition = self._best(), _acquired(hypothesis)
-        # Joint detection takes long.
-        is_long = acquisition.clock.exposure_slots > LONG_EXPOSURE_SLOTS
-        if is_long and self._n_in_vain >= SETTINGS.doubtful_budget:
-            return
-        if best is not None or is_long:
-            half = self._measured(hypothesis, acquisition.of_columns(acquisition.bright_columns))
+        bright, is_long = acquisition.of_columns(acquisition.bright_columns), _is_long(acquisition)
+        # A known camera keeps its first hypothesis without packets as well: it shows what the light is.
+        if best is not None or (is_long and hypothesis.camera.hypothesis is not None):
+            if self._is_spent(_work_of(bright)):
+                self._tried.append(Tried(hypothesis, 0.0, hypothesis.log_prior, "not tried"))
+                return
+            half = self._measured(hypothesis, bright)
             min_evidence = SETTINGS.few_packets if is_long else PASSES.min_packets_llr
             min_score, lead = -np.inf, 0.0
             if best is not None:
@@ -262,32 +289,43 @@ class _Walk:
                 is_plain = best.evidence > SETTINGS.plain
                 min_score = best.score + (lead if is_plain else -SETTINGS.reach)
                 min_evidence = min(min_evidence, best.evidence)
-            if half.score < min_score or half.evidence < max(min_evidence, self._least / 2):
+            is_likely = half.score >= min_score and half.evidence >= min_evidence
+            if not is_likely or self._is_spent(_work_of(acquisition), half.evidence):
                 # By the bright columns alone scores are others than by all: the best one shows by how much.
                 self._tried.append(Tried(hypothesis, half.evidence, half.score - lead, "half"))
-                self._n_in_vain += is_long
                 return
         scored = self._measured(hypothesis, acquisition)
         if scored.evidence > PASSES.min_packets_llr:
             # Packets may become certain once an estimated camera is fitted: then no other camera is tried.
             scored = self._fitted(scored)
         scored = _in_likeliest_bursts(scored)
-        self._n_in_vain += is_long and best is not None and scored.score <= best.score
         self._scored.append(scored)
         self._tried.append(Tried(hypothesis, scored.evidence, scored.score, "lost"))
         if scored.evidence > PASSES.min_packets_llr and (best is None or scored.score > best.score - SETTINGS.reach):
-            for sibling in self._proposer.siblings(scored):
+            for sibling in self.way_of(hypothesis).siblings(scored):
                 self._push(self._siblings, scored.score + sibling.log_prior - hypothesis.log_prior, sibling)
 
     def _measured(self, hypothesis: Hypothesis, acquisition: Acquisition) -> Scored:
-        with self._proposer.cache.timer("detect"):
-            return _rated(hypothesis, self._proposer.context(hypothesis), acquisition, initial_pass(acquisition))
+        proposer = self.way_of(hypothesis)
+        self._work += _work_of(acquisition)
+        with proposer.cache.timer("detect"):
+            return _rated(hypothesis, proposer.context(hypothesis), acquisition, initial_pass(acquisition))
 
 
 def _acquired(hypothesis: Hypothesis) -> Acquisition:
     assert hypothesis.profiles is not None
     assert hypothesis.clock is not None
     return Acquisition(hypothesis.screen, hypothesis.profiles, hypothesis.clock, hypothesis.variants)
+
+
+def _is_long(acquisition: Acquisition) -> bool:
+    return acquisition.clock.exposure_slots > LONG_EXPOSURE_SLOTS
+
+
+def _work_of(acquisition: Acquisition) -> int:
+    """Work of an initial pass, see `SearchSettings.work`."""
+    n_paths = QUICK_SURVIVORS.max_paths if _is_long(acquisition) else 1
+    return acquisition.clock.delay_slots.size * acquisition.clock.n_slots * n_paths
 
 
 def _rated(hypothesis: Hypothesis, context: FrameContext, acquisition: Acquisition, reception: Reception) -> Scored:

@@ -17,12 +17,12 @@ class SearchSettings(msgspec.Struct, frozen=True):
     #: Below this evidence an estimated camera is rejected; above the second no other one is proposed.
     few_packets: float = 40.0
     plain_estimate: float = 100.0
-    #: Maximum number of initial passes of a frame; if its columns do not stand out, and of unknown cameras' long
-    #: exposures, which take long, without evidence; of all without evidence.
-    budget: int = 24
-    doubtful_budget: int = 3
-    hopeless_budget: int = 8
-    #: Evidence of a screen without borders, times that of doubtful columns, from which it is taken instead.
+    #: Work on a picture, slots x columns that searches of clocks and initial passes go through, each path of joint
+    #: detection by itself; evidence above `plain_estimate` extends it in proportion. Right ones take 300,000 at most.
+    work: int = 400_000
+    #: Share of the lit columns with a believable packet, from which nothing that is stated is doubted.
+    settled_share: float = 0.2
+    #: Evidence of a clip's screen that has moved, times that of where it was, from which it is believed.
     borderless_gain: float = 2.0
     #: Siblings of a scored hypothesis get a pass if their score could come this near to the best one; log-odds within
     #: which an outline is possible.

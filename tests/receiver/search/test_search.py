@@ -17,7 +17,7 @@ from rxcli.ingest import open_source
 from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import ReceiverOptions
-from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, usual_screens
+from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, usual_screens
 from rxcli.receiver import camera as blind
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
@@ -29,8 +29,9 @@ from rxcli.receiver.search import Found, cameras, outlines, search
 from rxcli.receiver.search.evidence import distinct_share
 from rxcli.receiver.search.hypothesis import Hypothesis
 from rxcli.receiver.search.numbers import less_likely_outlines
-from rxcli.receiver.search.propose import Proposer
+from rxcli.receiver.search.propose import Proposer, ways
 from rxcli.receiver.search.search import _Walk
+from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.sync import clock as sync
 from rxcli.types import Frame, FrameResult, Metadata
 
@@ -167,34 +168,33 @@ def test_scores_by_the_bright_columns_compare_with_those_by_all() -> None:
 
 
 @pytest.mark.parametrize(
-    ("exposure_slots", "evidence", "least", "measured"),
+    ("exposure_slots", "evidence", "measured"),
     [
-        pytest.param(4.0, 30.0, 0.0, ["middle"] * 3, id="long exposures, until three were in vain"),
-        pytest.param(4.0, 50.0, 0.0, ["middle", "all"] * 4, id="long exposures, until three were no better"),
-        pytest.param(1.0, 1.0, 0.0, ["all", *["middle", "all"] * 4], id="short exposures"),
-        pytest.param(1.0, 100.0, 300.0, ["all", *["middle"] * 4], id="not all if more evidence is needed"),
+        pytest.param(4.0, 30.0, ["middle"] * 3, id="long exposures without packets"),
+        pytest.param(4.0, 50.0, ["middle", "all"] * 3, id="long exposures"),
+        pytest.param(1.0, 1.0, ["all", *["middle", "all"] * 2], id="short exposures"),
     ],
 )
 def test_hypotheses_are_measured_on_their_bright_columns_first(
-    exposure_slots: float, evidence: float, least: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
+    exposure_slots: float, evidence: float, measured: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock, own = SimpleNamespace(exposure_slots=exposure_slots), list[str]()
-    middle = SimpleNamespace(part="middle")
+    clock, own = SimpleNamespace(exposure_slots=exposure_slots, n_slots=1, delay_slots=np.zeros(20)), list[str]()
+    middle = SimpleNamespace(part="middle", clock=clock)
     acquisition = SimpleNamespace(clock=clock, part="all", bright_columns=None, of_columns=lambda _: middle)
 
     def measure(_: object, __: object, acquisition: Any) -> Any:
         own.append(acquisition.part)
-        return SimpleNamespace(score=0.0, evidence=evidence, reception=None)
+        return SimpleNamespace(score=0.0, evidence=evidence, reception=None, hypothesis=estimated)
 
     monkeypatch.setitem(_Walk.run.__globals__, "_acquired", lambda _: acquisition)
     monkeypatch.setattr(_Walk, "_measured", measure)
-    estimated: Any = SimpleNamespace(camera=SimpleNamespace(hypothesis=1), screen=SimpleNamespace(columns=20))
+    estimated: Any = SimpleNamespace(camera=SimpleNamespace(hypothesis=1), way=0)
     monkeypatch.setattr(_Walk, "_fitted", lambda _, scored: scored)
     monkeypatch.setitem(_Walk.run.__globals__, "_in_likeliest_bursts", lambda scored: scored)
     monkeypatch.setitem(_Walk.run.__globals__, "evidence", SimpleNamespace(bright_score=lambda _: 0.0))
-    proposer: Any = SimpleNamespace(siblings=lambda _: (), cameras=lambda: None)
-    walk = _Walk(proposer, 8, least)
-    for _ in range(5):
+    walk = _Walk([])
+    walk.ways.append(cast(Any, SimpleNamespace(way=0, siblings=lambda _: (), doubts=False)))
+    for _ in range(3):
         walk._score(estimated)
     assert own == measured
 
@@ -252,11 +252,59 @@ def test_a_refusal_says_what_came_nearest() -> None:
         assert found.tried
 
 
-def test_the_budget_bounds_the_passes() -> None:
+@pytest.mark.parametrize("gives_up", [True, False])
+def test_a_picture_without_evidence_ends_when_its_work_is_done(gives_up: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    noise = np.random.default_rng(1).integers(90, 110, (620, 340), np.uint8)
+    corners = np.array([[10, 10], [329, 10], [329, 609], [10, 609]], float)
+    camera = check_profile(tomllib.loads(CAMERA), CameraProfile, "camera")
+    options = ReceiverOptions(cameras=(camera,), force_camera=True, corners=corners)
+    monkeypatch.setitem(_Walk.run.__globals__, "SETTINGS", msgspec.structs.replace(SETTINGS, work=1))
+    walk = _Walk([Proposer(FrameCache(Frame(noise, "noise")), options, (Outline(corners),))], gives_up)
+    fates = [tried.fate for tried in walk.record(walk.run())]
+    assert (fates.count("not tried") > 0) == gives_up
+    assert len(fates) - fates.count("not tried") == (1 if gives_up else len(fates))
+
+
+def test_evidence_extends_the_work_and_ends_the_doubt_of_what_is_stated() -> None:
     trial = trial_of("paper-17k3")
-    options = replace(trial.options(), screens=SHIPPED)
-    walk = _Walk(Proposer(FrameCache(trial.frame), options, (Outline(trial.corners),)), 1)
-    assert len(walk.record(walk.run())) == 1
+    found = search(FrameCache(trial.frame), replace(trial.options(), screens=SHIPPED), may_doubt=True)
+    assert isinstance(found, Found)
+    assert not found.doubts
+    assert "not tried" not in [tried.fate for tried in found.tried]
+
+
+def test_ways_to_look_at_a_picture_come_in_the_order_of_their_likelihood() -> None:
+    trial = trial_of("paper-17k3")
+    stated = replace(trial.frame, metadata=replace(trial.frame.metadata, exposure_s=1e-4))
+    outlines = [Outline(trial.corners)]
+    options = replace(trial.options(), corners=None)
+    looked = list(ways(FrameCache(stated), options, outlines, may_doubt=True))
+    priors = [way.log_prior for way in looked]
+    assert priors == sorted(priors, reverse=True)
+    assert looked[0].log_prior == 0.0
+    assert [way.cache.frame.metadata.exposure_s for way in looked if way.doubts] == [1e-4, None]
+    assert [way.options.cameras for way in looked if way.doubts] == [(), ()]
+    assert not any(way.doubts for way in ways(FrameCache(stated), options, outlines))
+
+
+@pytest.mark.parametrize(
+    ("screen", "stated_us", "found_us", "contradicts"),
+    [
+        ("paper-8k65", 100, 100, False),
+        ("paper-8k65", 100, 130, False),  # Nearer to its own slots than to those of another rate.
+        ("paper-8k65", 100, 200, True),  # As many slots as it lasts at 17.3 kHz.
+        ("paper-17k3", 100, 50, True),
+        ("paper-8k65", None, 200, False),
+    ],
+)
+def test_an_exposure_may_be_that_of_a_screen_of_another_rate(
+    screen: str, stated_us: float | None, found_us: float, contradicts: bool
+) -> None:
+    frame = Frame(np.zeros((2, 2), np.uint8), "photo", metadata=Metadata(exposure_s=stated_us and stated_us * 1e-6))
+    camera = SimpleNamespace(exposure_s=found_us * 1e-6, line_delay_s=1e-5)
+    own = SimpleNamespace(screen=load_profile(screen, ScreenProfile))
+    scored: Any = SimpleNamespace(context=SimpleNamespace(camera=camera), hypothesis=own)
+    assert Proposer(FrameCache(frame), ReceiverOptions(), ()).contradicts(scored) == contradicts
 
 
 @pytest.mark.parametrize(("exposure_slots", "n_sought"), [(1.5, 1), (3.0, 2)])
