@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.combs import find_combs, grid_of_comb
 from rxcli.receiver.screen.courses import tilted_course
-from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_through
+from rxcli.receiver.screen.grid import Grid, columns_at, grid_through
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.screen.rows import find_rows
@@ -42,8 +42,6 @@ _PLAIN_CONTRAST, _N_FITTED = 0.22, 2
 _BY_EXPLAINED, _BY_PERSPECTIVE = 7.0, -1.0
 #: Score that a screen costs which is seen from the side, however far: one picture in twenty.
 _FROM_THE_SIDE = -0.3
-#: Score by which grids between the sides of a bright part are ahead of those of combs.
-_OF_PART = 0.4
 #: Contrast of one screen's grid, as a share of that of two, from which there is one: over two it has that of one alone.
 _ONE_SCREEN = 0.9
 #: Contrast, times what chance gives, from which packets are looked for; of a part of a picture it must be plainer.
@@ -100,13 +98,11 @@ def find_screens(
             return [_numbered(fine, grid, narrow, parts)]
     if not wide:
         return []
-    size = (plane.width, plane.height)
-    rivals = [grid_between(corners, wide[0].n_columns, size, lens) for corners in parts]
 
     def along(course: Course) -> PictureStrips:
         return read_strips(plane, lens, course=course)
 
-    placed = wide_grid(strips, wide[0].sigma, rivals, _POSSIBLE_CONTRAST, along)
+    placed = wide_grid(strips, wide[0].sigma, _POSSIBLE_CONTRAST, along)
     return [_numbered(*placed, wide, parts)] if placed else []
 
 
@@ -179,7 +175,6 @@ def thinned(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white:
 def wide_grid(
     strips: PictureStrips,
     sigma: float,
-    rivals: Sequence[Grid] = (),
     least: float = 1.0,
     along: Callable[[Course], PictureStrips] | None = None,
 ) -> _Placed | None:
@@ -188,7 +183,6 @@ def wide_grid(
     Args:
         strips: of the picture, upright.
         sigma: light spread of the screen, column pitches.
-        rivals: grids that compete with those of the combs, unless the strongest comb's is plain.
         least: minimum contrast, times what chance gives.
         along: reads the strips of the picture along columns that lean; None if only upright ones are sought.
     """
@@ -198,16 +192,11 @@ def wide_grid(
     if is_plain:
         starts = starts[:1]
     else:
-        starts += [(strips, rival) for rival in rivals if with_light(_half(strips), rival, sigma).contrast > 0]
         course = along and tilted_course(quiet)
         if along and course:
             starts += _leaning_starts(along, course, sigma)
-    # A part of the picture with four straight sides is mostly the screen where its borders stand out nearly as well.
-    ahead = [_OF_PART * any(grid is rival for rival in rivals) for _, grid in starts]
     placed = [_fitted(own, grid, sigma, along) for own, grid in starts]
-    scored = [(_score(own[1]) + more, own) for own, more in zip(placed, ahead, strict=True)]
-    scored = [own for own in scored if _stands_out(*own[1], least)]
-    return max(scored, key=lambda own: own[0])[1] if scored else None
+    return max((own for own in placed if _stands_out(*own, least)), key=lambda own: _score(own[1]), default=None)
 
 
 def _starts(strips: PictureStrips, quiet: PictureStrips, sigma: float) -> list[_Placed]:

@@ -32,7 +32,7 @@ _NEAR_WIDTHS, _FAR_WIDTHS, _NARROW_RATIO = 0.004, 0.01, 0.72
 #: share of the light that each has, and mean coherence of all strips, at least.
 _GAP_LIGHT, _MIN_GAP_WIDTHS, _MIN_APART, _MIN_APART_LIGHT = 0.25, 0.015, 0.2, 0.1
 #: Power of stripes that belong to a box, of the clearest; windows and strips without stripes that it bridges.
-_STRIPED, _BRIDGED = 0.05, (3, 21)
+_STRIPED, _BRIDGED = 0.1, (3, 21)
 #: Distance of the pairs of strips that show borders best, columns.
 _PAIR_DISTANCE = 0.72
 #: Averaged rows whose mean the band pass takes off.
@@ -168,7 +168,9 @@ class PictureStrips:
         import cv2
 
         is_striped = (self.stripes > _STRIPED * float(np.quantile(self.stripes, 0.99))).astype(np.uint8)
-        is_striped = cv2.morphologyEx(is_striped, cv2.MORPH_CLOSE, np.ones(_BRIDGED, np.uint8))
+        (down, across), bridge = _BRIDGED, np.ones(_BRIDGED, np.uint8)
+        padded = np.pad(is_striped, ((down, down), (across, across)))
+        is_striped = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, bridge)[down:-down, across:-across]
         parts = cv2.connectedComponentsWithStats(is_striped)[2][1:]
         if not len(parts):
             return None

@@ -20,11 +20,8 @@ from rxcli.receiver.search.cameras import known_lens
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.types import FloatArray, Frame, Remark
 
-#: Log-odds of the bright part of a picture against columns that were found.
-_BRIGHT_LOG_ODDS = -50.0
-#: Natural logarithm of the ratio of aspects up to which a bright part may be the screen, and its probability beyond: of
-#: 39 bright parts of dark pictures none had the screen's aspect, and films alone, one in three, its width.
-_SAME_ASPECT, _FILM_CERTAINTY = 0.08, 0.3
+#: Log-odds of a bright part with four straight sides against the box around stripes.
+_BRIGHT_LOG_ODDS = 50.0
 
 
 def proposed_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[Outline]] | Failure:
@@ -51,22 +48,18 @@ def without_borders(cache: FrameCache) -> list[Outline]:
     if not may_fill(frame):
         return []
     with cache.timer("geometry"):
-        bright, striped = _bright(cache), cache.once("striped", lambda: find.striped_box(cache.plane))
+        striped = cache.once("striped", lambda: find.striped_box(cache.plane))
     if striped is None:
         return []
-    own = Outline(
-        striped, SETTINGS.sure_certainty, column_offset=None, log_odds=_BRIGHT_LOG_ODDS, family=-2, stands_out=False
-    )
-    outlines = [own] if bright is None else [replace(own, corners=bright, log_odds=0.0, family=-1), own]
-    return [_viewed(outline, frame) for outline in outlines]
-
-
-def _bright(cache: FrameCache) -> FloatArray | None:
-    """Corners of the brightest part of a picture."""
-    return _parts(cache)[0]
+    # Sides that are seen are nearer than those of stripes.
+    own = Outline(striped, SETTINGS.sure_certainty, column_offset=None, family=-1, stands_out=False)
+    bright = _parts(cache)[0]
+    better = [] if bright is None else [replace(own, corners=bright, family=-2, log_odds=_BRIGHT_LOG_ODDS)]
+    return [_viewed(outline, frame) for outline in (*better, own)]
 
 
 def _parts(cache: FrameCache) -> list[FloatArray | None]:
+    """Corners of the bright parts of a picture."""
     return cache.once("parts", lambda: bright_parts(cache.plane))
 
 
@@ -93,7 +86,6 @@ def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
     layouts, frame = layouts_of(options), cache.frame
     lens = known_lens(frame, options)
     with cache.timer("geometry"):
-        bright = _bright(cache)
         key = ("screens", *layouts, key_of(lens))
         parts = [part for part in _parts(cache) if part is not None]
         screens = cache.once(key, lambda: find.find_screens(cache.plane, layouts, lens, parts))
@@ -104,21 +96,7 @@ def possible_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[O
         outline = _viewed(outline, frame)
         return replace(outline, n_columns=None if wide == [outline.n_columns] else outline.n_columns)
 
-    outlines = [[viewed(outline) for outline in screen] for screen in screens]
-    if len(outlines) == 1 and bright is not None:
-        # The picture on the screen may show borders that are none of the columns'.
-        certainty = SETTINGS.sure_certainty if _may_be_screen(bright, layouts) else _FILM_CERTAINTY
-        own = viewed(Outline(bright, certainty, log_odds=_BRIGHT_LOG_ODDS, family=-1))
-        tolerance = SETTINGS.same_sides * np.ptp(bright[:, 0])
-        if all(np.abs(outline.corners - own.corners).max() >= tolerance for outline in outlines[0]):
-            outlines[0].append(own)
-    return outlines
-
-
-def _may_be_screen(corners: FloatArray, layouts: list[find.ColumnLayout]) -> bool:
-    """Whether a part of the picture has a screen's aspect, unlike windows and films."""
-    width, height = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1).reshape(2, 2).sum(axis=0)
-    return any(abs(np.log(width / height / layout.aspect)) < _SAME_ASPECT for layout in layouts)
+    return [[viewed(outline) for outline in screen] for screen in screens]
 
 
 def layouts_of(options: ReceiverOptions) -> list[find.ColumnLayout]:
@@ -217,7 +195,7 @@ def reason_for_none(cache: FrameCache) -> Remark:
         return Remark("no_columns_dark", {"mean_percent": 100 * max(mean, 0.0)})
     if is_striped:
         return common or Remark("no_columns_striped")
-    return Remark("no_columns" if _bright(cache) is None else "lit")
+    return Remark("no_columns" if _parts(cache)[0] is None else "lit")
 
 
 def too_small(context: FrameContext, screen: ScreenProfile) -> Remark | None:

@@ -9,12 +9,9 @@ import pytest
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.plane import read_plane
 from rxcli.receiver.receive import receive_frame
 from rxcli.receiver.screen.bright import bright_parts
-from rxcli.receiver.screen.outline import Outline
-from rxcli.receiver.search import outlines
 from rxcli.types import Frame
 
 CORNERS = np.array([[210.0, 120.0], [1390.0, 160.0], [1370.0, 860.0], [190.0, 800.0]])
@@ -66,16 +63,6 @@ def test_a_dark_screen_is_a_faint_part_around_a_bright_window(step: int) -> None
     np.testing.assert_allclose(found[0], [[500, 300], [1000, 300], [1000, 700], [500, 700]], atol=20)
     near = [corners for corners in found if np.abs(corners - CORNERS).max() < 20]
     assert len(near) == bool(step)
-
-
-@pytest.mark.parametrize(("height", "certainty"), [(1.0, 0.9), (0.7, 0.3)])
-def test_a_bright_part_without_the_aspect_of_a_screen_is_hardly_the_screen(
-    monkeypatch: pytest.MonkeyPatch, height: float, certainty: float
-) -> None:
-    cache = FrameCache(picture_of(CORNERS * [1, height]))
-    monkeypatch.setattr(outlines.find, "find_screens", lambda *_: [[Outline(np.zeros((4, 2)))]])
-    (found,) = outlines.possible_screens(cache, ReceiverOptions())
-    assert found[-1].certainty == certainty
 
 
 def test_a_checkerboard_is_received() -> None:

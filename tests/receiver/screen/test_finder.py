@@ -308,15 +308,6 @@ def test_the_true_grid_explains_more_than_others_and_is_reached_from_near() -> N
     assert np.abs(off).max() < 0.3
 
 
-def test_a_rival_replaces_missing_combs_where_borders_show(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(find, "find_combs", lambda *_: [])
-    strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
-    x, y = strips.x, strips.y
-    _, reached = wide_grid(strips, 0.45, [true.shifted(0.2)])
-    assert np.abs(columns_at(reached.coefficients, x, y) - columns_at(true.coefficients, x, y)).max() < 0.3
-    assert not wide_grid(strips, 0.45, [true.shifted(0.5)])
-
-
 @pytest.mark.parametrize(
     ("share", "true_light", "light"),
     [
@@ -341,8 +332,6 @@ def test_grids_compare_by_contrast_and_by_what_they_explain(
     monkeypatch.setattr(find, "moved_by_waveforms", lambda _, grid, *__: grid)
     monkeypatch.setattr(find, "with_light", lit)
     assert wide_grid(strips, 0.45)[1].coefficients[1] == rivals[0].coefficients[1]
-    monkeypatch.setattr(find, "find_combs", lambda *_: rivals[:1])
-    assert wide_grid(strips, 0.45, rivals[1:])[1].coefficients[1] == rivals[share == 1.2].coefficients[1]
 
 
 def test_combs_are_fitted_by_their_likelihood_as_borders_out_of_place_stand_out_little(
