@@ -40,6 +40,9 @@ def bright_parts(plane: LightPlane) -> list[FloatArray | None]:
     for small, gap in ((fine, _FILLED), *((cv2.blur(fine, _AVERAGED), _GAP),) * _FAINT_LEVELS):
         rest = small[::_SAMPLED, ::_SAMPLED]
         rest = rest[rest <= least]
+        if not rest.size:  # A picture of few pixels.
+            found.append(None)
+            continue
         low, high = np.percentile(rest, (_TAIL, 100 - _TAIL))
         scale = _WHITE / max(float(high - low), TINY)
         level, _ = cv2.threshold(_bytes((rest - low) * scale), 0, _WHITE, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
