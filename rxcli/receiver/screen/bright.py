@@ -36,7 +36,8 @@ def bright_parts(plane: LightPlane) -> list[FloatArray | None]:
     light, pixels = np.diff(plane.sums[::cells], axis=0), cells * plane.cell_px
     size = max(light.shape[1] // pixels, 1), len(light)
     fine = cv2.resize(light, size, interpolation=cv2.INTER_AREA).T
-    found, least = [], np.inf
+    found: list[FloatArray | None] = []
+    least = np.inf
     for small, gap in ((fine, _FILLED), *((cv2.blur(fine, _AVERAGED), _GAP),) * _FAINT_LEVELS):
         rest = small[::_SAMPLED, ::_SAMPLED]
         rest = rest[rest <= least]
