@@ -214,7 +214,7 @@ def test_times_that_do_not_advance_are_counted_in_frames(bench: Bench, pace: flo
     ("arguments", "faults", "code", "last"),
     [
         (["--json", "-"], {"unplug_after": 40}, ExitCode.UNREADABLE, f"{UNPLUGGED}; --wait waits for it"),
-        (["--frames", "3"], {}, ExitCode.NOT_RECEIVED, "no signal | columns 0/0"),
+        (["--frames", "3"], {}, ExitCode.NOT_RECEIVED, "no screen | columns 0/0"),
         ([], {"interrupt_after": 5}, ExitCode.INTERRUPTED, "vlc-rx: interrupted"),
         # A camera that is busy, sends nothing, or nothing whole: a duration counts from the start, whatever comes.
         *(

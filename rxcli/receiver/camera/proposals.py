@@ -23,6 +23,8 @@ from rxcli.types import Float32Array, FloatArray
 
 #: Samples a slot at which headers are sought; bins of the spectrum to a line's width.
 _SAMPLES, _FINE = 4, 4
+#: Rows after which the mosaic of colours shows.
+_MOSAIC_ROWS = 4
 #: Shape of a slot's difference from the next, _SAMPLES a slot.
 _TRIANGLE = np.convolve(np.full(_SAMPLES, 1 / _SAMPLES), np.full(_SAMPLES, 1 / _SAMPLES))
 
@@ -83,9 +85,11 @@ def propose(
 
 def _in_phase(strips: ColumnStrips, clock: CameraHypothesis, *, may_bend: bool) -> CameraHypothesis:
     """A clock of a short exposure with rows per slot and bend by the whole picture, where that is plain."""
-    if clock.exposure_slots > LONG_EXPOSURE_SLOTS:
+    rows = clock.rows_per_slot / strips.pitch
+    # Beside the line of the mosaic, its phase and that of the slots are not told apart.
+    if clock.exposure_slots > LONG_EXPOSURE_SLOTS or abs(rows / _MOSAIC_ROWS - 1) < 2 * SETTINGS.off_clock:
         return clock
-    found = along_the_line(strips, clock.rows_per_slot / strips.pitch, SETTINGS.off_clock, may_bend=may_bend)
+    found = along_the_line(strips, rows, SETTINGS.off_clock, may_bend=may_bend)
     # Lines of text have a phase as well.
     if found is None or found[2] < 2 * SETTINGS.max_line:
         return clock

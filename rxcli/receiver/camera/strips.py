@@ -52,11 +52,12 @@ def strips_of(profiles: RowProfiles, x: FloatArray, width: int, height: int) -> 
         """(M, join, R), a column's last strip left out where their number is odd."""
         return values.reshape(n_columns, n_strips, n_rows)[:, :n_used].reshape(-1, join, n_rows)
 
-    inside: Float32Array = np.asarray(pooled(profiles.inside).all(axis=1), np.float32)
+    light = pooled(profiles.light)
+    is_inside = (pooled(profiles.inside) & np.isfinite(light)).all(axis=1)
     pixels = max(float(np.median(profiles.count)), 1.0) * join
     return ColumnStrips(
-        light=pooled(profiles.light).mean(axis=1) * inside,
-        inside=inside,
+        light=np.where(is_inside[:, None], light, 0).mean(axis=1),
+        inside=is_inside.astype(np.float32),
         x=pooled(x).mean(axis=1, dtype=np.float64),
         rows=profiles.rows.astype(np.float64),
         n_columns=n_columns,

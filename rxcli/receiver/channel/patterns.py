@@ -11,7 +11,7 @@ from rxcli.protocol import slot_patterns
 from rxcli.receiver.light import Exposure
 from rxcli.types import Float32Array
 
-#: Passes over the slots, each with the neighbours as the pass before has them: a slot hears of so many on either side.
+#: Passes over the slots, each with the neighbours as the pass before has them.
 _PASSES = 3
 #: Least distance of a slot's probability from 0 and 1, and the largest log-likelihood ratio.
 _MIN_DOUBT = 1e-4
@@ -27,8 +27,8 @@ def llr_of(lit: Float32Array) -> Float32Array:
 def slot_llr(metrics: Float32Array, lit: Float32Array | None = None) -> Float32Array:
     """(C, N) log-likelihood ratio of each slot being lit by its own light.
 
-    A slot contributes to its own metric and to the `isi_memory` metrics after it; their ratios are added. What a metric
-    tells of a slot takes the other slots from the other metrics alone (belief propagation), or it would count twice.
+    A slot contributes to its own metric and to the `isi_memory` metrics after it; their ratios are added. A metric's
+    ratio for a slot takes the other slots from the other metrics alone (belief propagation), so that none counts twice.
 
     Args:
         metrics: (C, N + memory, patterns) log-likelihood of every pattern of slots n - memory .. n.
@@ -41,18 +41,18 @@ def slot_llr(metrics: Float32Array, lit: Float32Array | None = None) -> Float32A
     by_pattern = np.ascontiguousarray(metrics.reshape(-1, n_patterns).T, np.float32)
     is_shown = np.ptp(by_pattern, axis=0).reshape(n_columns, n_metrics) > 0
     llr = np.zeros((n_columns, n_slots), np.float32) if lit is None else llr_of(lit)
-    told = np.zeros((isi_memory + 1, n_columns, n_metrics), np.float32)
+    gained = np.zeros((isi_memory + 1, n_columns, n_metrics), np.float32)
     for _ in range(_PASSES if lit is None else 1):
         prior = np.pad(llr, ((0, 0), (isi_memory, isi_memory)))
         by_age = np.stack([prior[:, isi_memory - age :][:, :n_metrics] for age in range(isi_memory + 1)])
-        odds = np.clip(by_age - told, -_MAX_LLR, _MAX_LLR)
+        odds = np.clip(by_age - gained, -_MAX_LLR, _MAX_LLR)
         likelihood = is_lit.T @ odds.reshape(isi_memory + 1, -1)
         likelihood += by_pattern
         likelihood -= likelihood.max(axis=0)
         np.exp(likelihood, out=likelihood)
-        told = np.log(is_lit @ likelihood + MIN_FLOAT32) - np.log((1 - is_lit) @ likelihood + MIN_FLOAT32)
-        told = (told.reshape(odds.shape) - odds) * is_shown
-        llr = np.asarray(sum(of_age[:, age : age + n_slots] for age, of_age in enumerate(told)), np.float32)
+        gained = np.log(is_lit @ likelihood + MIN_FLOAT32) - np.log((1 - is_lit) @ likelihood + MIN_FLOAT32)
+        gained = (gained.reshape(odds.shape) - odds) * is_shown
+        llr = np.asarray(sum(of_age[:, age : age + n_slots] for age, of_age in enumerate(gained)), np.float32)
     return llr
 
 

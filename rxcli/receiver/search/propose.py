@@ -206,7 +206,7 @@ def ways(
     stated = Proposer(cache, options, tuple(outlines), known, may_bend)
     yield stated
     less_likely = replace(stated, way=1, log_prior=-SETTINGS.reach)
-    if outlines[0].family >= 0 and not outlines[0].leans and (without := without_borders(cache)):
+    if outlines[0].family >= 0 and (without := without_borders(cache)):
         # Of one column that sends alone, its own rows give the camera, and given corners its number.
         is_given = options.corners is not None
         yield replace(less_likely, outlines=tuple(outlines if is_given else without), lit=tuple(without))
