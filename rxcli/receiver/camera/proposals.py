@@ -86,7 +86,7 @@ def propose(
 def _in_phase(strips: ColumnStrips, clock: CameraHypothesis, *, may_bend: bool) -> CameraHypothesis:
     """A clock of a short exposure with rows per slot and bend by the whole picture, where that is plain."""
     rows = clock.rows_per_slot / strips.pitch
-    # Beside the line of the mosaic, its phase and that of the slots are not told apart.
+    # Beside the line of the mosaic, its phase cannot be distinguished from that of the slots.
     if clock.exposure_slots > LONG_EXPOSURE_SLOTS or abs(rows / _MOSAIC_ROWS - 1) < 2 * SETTINGS.off_clock:
         return clock
     found = along_the_line(strips, rows, SETTINGS.off_clock, may_bend=may_bend)
