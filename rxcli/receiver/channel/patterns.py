@@ -36,24 +36,28 @@ def slot_llr(metrics: Float32Array, lit: Float32Array | None = None) -> Float32A
     """
     isi_memory = int(metrics.shape[-1]).bit_length() - 2
     n_columns, n_metrics, n_patterns = metrics.shape
-    is_lit, n_slots = _lit_by_age(isi_memory), n_metrics - isi_memory
+    is_lit = _lit_by_age(isi_memory)
     # Patterns first: long vectors although patterns are few.
     by_pattern = np.ascontiguousarray(metrics.reshape(-1, n_patterns).T, np.float32)
     is_shown = np.ptp(by_pattern, axis=0).reshape(n_columns, n_metrics) > 0
-    llr = np.zeros((n_columns, n_slots), np.float32) if lit is None else llr_of(lit)
+    # With the slots before and after the grid, which the first and the last metrics show as well.
+    llr = np.zeros((n_columns, n_metrics + isi_memory), np.float32)
+    if lit is not None:
+        llr[:, isi_memory:n_metrics] = llr_of(lit)
+    of_age = [slice(isi_memory - age, isi_memory - age + n_metrics) for age in range(isi_memory + 1)]
     gained = np.zeros((isi_memory + 1, n_columns, n_metrics), np.float32)
     for _ in range(_PASSES if lit is None else 1):
-        prior = np.pad(llr, ((0, 0), (isi_memory, isi_memory)))
-        by_age = np.stack([prior[:, isi_memory - age :][:, :n_metrics] for age in range(isi_memory + 1)])
-        odds = np.clip(by_age - gained, -_MAX_LLR, _MAX_LLR)
+        odds = np.clip(np.stack([llr[:, part] for part in of_age]) - gained, -_MAX_LLR, _MAX_LLR)
         likelihood = is_lit.T @ odds.reshape(isi_memory + 1, -1)
         likelihood += by_pattern
         likelihood -= likelihood.max(axis=0)
         np.exp(likelihood, out=likelihood)
         gained = np.log(is_lit @ likelihood + MIN_FLOAT32) - np.log((1 - is_lit) @ likelihood + MIN_FLOAT32)
         gained = (gained.reshape(odds.shape) - odds) * is_shown
-        llr = np.asarray(sum(of_age[:, age : age + n_slots] for age, of_age in enumerate(gained)), np.float32)
-    return llr
+        llr = np.zeros_like(llr)
+        for part, values in zip(of_age, gained, strict=True):
+            llr[:, part] += values
+    return llr[:, isi_memory:n_metrics]
 
 
 @cache

@@ -1,6 +1,7 @@
 """The light model against numeric integration and links whose every slot is known."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -343,3 +344,16 @@ def test_tails_of_the_crosstalk_by_decided_slots(tails: float, n_wrong: int, ben
     wide = model.with_tails(spread, (estimate, sd)).crosstalk.shares
     np.testing.assert_allclose(wide.sum(axis=1), 1)
     assert (wide[:, 1] < 0.97 * model.crosstalk.shares[:, 1]).all() == bool(tails)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_ratios_of_slots_agree_with_enumeration_of_all_slots(seed: int) -> None:
+    """Of a chain, as through exposures of a slot: no metric counts twice, slots before and after the grid are open."""
+    n_slots = 6
+    metrics = np.random.default_rng(seed).normal(0, 0.7, (1, n_slots + 1, 4)).astype(np.float32)
+    sequences = np.array(list(product((0, 1), repeat=n_slots + 2)))
+    patterns = 2 * sequences[:, :-1] + sequences[:, 1:]
+    likelihood = np.exp(metrics[0, np.arange(n_slots + 1), patterns].sum(axis=1, dtype=np.float64))
+    own = sequences[:, 1:-1]
+    exact = np.log(likelihood @ own) - np.log(likelihood @ (1 - own))
+    np.testing.assert_allclose(slot_llr(metrics)[0], exact, atol=0.06)
