@@ -78,14 +78,14 @@ def _in_total_order(options: ReceiverOptions) -> ReceiverOptions:
 
 def receive_frame(frame: Frame, options: ReceiverOptions, on_taps: OnTaps | None = None) -> FrameResult:
     """Receive one frame as a photograph; see `receive`."""
-    cache = FrameCache(frame)
+    cache, in_order = FrameCache(frame), _in_total_order(options)
     if (reason := ruled_out(cache, options)) is not None:
         result = failed(FrameResult(frame.source, frame.index, frame.time_s, "ok"), Failure(reason, "no_screen"))
         return replace(result, remarks=(reason, Remark("not_searched")))
     with one_blas_thread():
         cache = cache.in_blinking_colours()
-        received = _receive_either_way(cache, _in_total_order(options))
-        soft = _with_cut_packets(cache, received, _in_total_order(options))
+        received = _receive_either_way(cache, in_order)
+        soft = _with_cut_packets(cache, received, in_order)
     result = _without_unlikely_screen(received.result, soft)
     remarks, skipped = _with_part_in_view(result.remarks, soft), result.skipped
     n_left = sum(step.fate == "not tried" for step in result.search)

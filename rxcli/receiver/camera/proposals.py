@@ -320,7 +320,7 @@ def _long_exposures(
     tried += [(rows, np.zeros(4), strength) for rows, strength in lines if rows <= SETTINGS.min_phase_rows]
     found = sorted((line for line in tried if line), key=lambda line: -line[2])
     for number, (rows, curvature, strength) in enumerate(found):
-        if strength < SETTINGS.min_line_share * found[0][2] or _is_among(rows, found[:number]):
+        if strength < SETTINGS.min_line_share * found[0][2] or _is_among(rows, (line[0] for line in found[:number])):
             continue
         change, _ = changes_over(strips.light, strips.inside, rows, strips.noise.sigma)
         exposure = exposure_by_changes(columns_of(change, strips.n_columns), rows)
@@ -330,8 +330,8 @@ def _long_exposures(
             return
 
 
-def _is_among(rows: float, lines: Sequence[tuple[float, ...] | tuple[float, FloatArray, float]]) -> bool:
-    return any(abs(np.log(rows / line[0])) < SETTINGS.same_clock for line in lines)
+def _is_among(rows: float, known: Iterable[float]) -> bool:
+    return any(abs(np.log(rows / near)) < SETTINGS.same_clock for near in known)
 
 
 def exposure_by_changes(columns: Float32Array, rows_per_slot: float) -> float:
@@ -392,7 +392,7 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
         found += [(float(spectrum[round(peak)]), size / peak) for peak in peaks.tolist() if peak > 0]
     distinct: list[tuple[float, float]] = []
     for strength, rows in sorted(found, reverse=True):
-        if len(distinct) < SETTINGS.n_peaks and not _is_among(rows, distinct):
+        if len(distinct) < SETTINGS.n_peaks and not _is_among(rows, (line[0] for line in distinct)):
             distinct.append((rows, strength))
     return distinct
 

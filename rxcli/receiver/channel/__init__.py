@@ -23,7 +23,7 @@ sample with its local extremes.
 
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods
 from rxcli.receiver.channel.model import ObservationModel, estimate_black_level, estimate_tails
-from rxcli.receiver.channel.patterns import initial_llr, llr_of
+from rxcli.receiver.channel.patterns import initial_llr, lit_of, llr_of
 from rxcli.receiver.channel.steady import without_steady_light
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "estimate_black_level",
     "estimate_tails",
     "initial_llr",
+    "lit_of",
     "llr_of",
     "slot_likelihoods",
     "without_steady_light",

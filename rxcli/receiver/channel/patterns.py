@@ -24,6 +24,11 @@ def llr_of(lit: Float32Array) -> Float32Array:
     return np.asarray(np.log(bounded) - np.log1p(-bounded), np.float32)
 
 
+def lit_of(llr: Float32Array) -> Float32Array:
+    """Probabilities that slots are lit, from their log-likelihood ratios."""
+    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * llr), np.float32)
+
+
 def slot_llr(metrics: Float32Array, lit: Float32Array | None = None) -> Float32Array:
     """(C, N) log-likelihood ratio of each slot being lit by its own light.
 

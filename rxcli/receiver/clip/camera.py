@@ -168,7 +168,7 @@ class ClipCamera:
             has_left = _width_in_view(anywhere.outline.corners, cache.frame) < _width_in_view(corners, cache.frame)
             distance_px = np.abs(anywhere.outline.corners - corners)[:, 0].max()
             is_same = distance_px < np.ptp(corners[:, 0]) / (2 * USUAL_COLUMNS)
-            if anywhere.evidence > (search_settings.borderless_gain if has_left or is_same else 1.0) * here:
+            if anywhere.evidence > (SETTINGS.moved_gain if has_left or is_same else 1.0) * here:
                 return anywhere
         return there
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
+from rxcli.receiver.channel import lit_of
 from rxcli.receiver.clip.acquiring import Window
 from rxcli.receiver.clip.camera import Acquired, ClipCamera, Located
 from rxcli.receiver.clip.ledger import Ledger
@@ -202,7 +203,7 @@ class ClipReceiver:
         """What a frame that was received like a photograph shows."""
         llr = reception.llr
         if decides_jointly(acquired.initial.clock):
-            llr = by_copy_llr(np.float32(0.5) * (1 + np.tanh(np.float32(0.5) * llr)))
+            llr = by_copy_llr(lit_of(llr))
         is_sum = self._adds_up(acquired.initial)
         return View(
             acquired.context,

@@ -103,6 +103,8 @@ class ClipSettings(msgspec.Struct, frozen=True):
     wrong_clocks: float = 0.05
     #: Lead of the headers' place over the best elsewhere.
     min_lead: float = 1.4
+    #: Evidence of a screen that has moved, times that of where it was, from which it is believed.
+    moved_gain: float = 2.0
 
 
 SETTINGS = ClipSettings()

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rxcli.receiver.screen.grid import Grid
-from rxcli.receiver.screen.strips import UPRIGHT, PictureStrips
+from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import FloatArray, Lens
 
 
@@ -45,11 +45,6 @@ class Outline:
     def contrast(self) -> float:
         """Log-likelihood by which its columns' borders stand out; 0 where it was given."""
         return self.grid.contrast if self.grid else 0.0
-
-    @property
-    def leans(self) -> bool:
-        """Whether it was found along columns that lean: no upright part of the picture is the screen."""
-        return self.strips is not None and self.strips.course != UPRIGHT
 
     @property
     def result_fields(self) -> dict[str, Any]:

@@ -22,8 +22,6 @@ class SearchSettings(msgspec.Struct, frozen=True):
     work: int = 400_000
     #: Share of the lit columns with a believable packet, from which nothing that is stated is doubted.
     settled_share: float = 0.2
-    #: Evidence of a clip's screen that has moved, times that of where it was, from which it is believed.
-    borderless_gain: float = 2.0
     #: Siblings of a scored hypothesis get a pass if their score could come this near to the best one; log-odds within
     #: which an outline is possible.
     reach: float = 3.0

@@ -5,6 +5,7 @@ import numpy as np
 from rxcli.protocol import HEADER, SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.known_picture.picture import ColumnLight
 from rxcli.receiver.channel.known_picture.settings import SETTINGS
+from rxcli.receiver.channel.patterns import lit_of
 from rxcli.receiver.light import take_places
 from rxcli.types import Clock, Float32Array, FloatArray
 
@@ -28,7 +29,7 @@ def first_decision(observed: ColumnLight, positions: FloatArray, clock: Clock) -
     for rows in (top + place for place in range(int(2 * reach) + 1)):
         is_near = (rows <= middle + reach) & (rows >= 0) & (rows < n_rows)
         llr += take_places(weighted, np.where(is_near, rows, n_rows))
-    return np.asarray(0.5 + 0.5 * np.tanh(0.5 * llr), np.float32)
+    return lit_of(llr)
 
 
 def header_contrast(observed: ColumnLight, positions: FloatArray, clock: Clock) -> float:
