@@ -19,7 +19,7 @@ from rxcli.lab.simulate.population import Population
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.receiver.plane import read_plane
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.bright import bright_quadrilateral, faint_quadrilaterals
+from rxcli.receiver.screen.bright import bright_parts
 from rxcli.receiver.screen.find import ColumnLayout, find_screens
 from rxcli.receiver.screen.grid import columns_at
 from rxcli.receiver.screen.numbering import (
@@ -43,11 +43,11 @@ SCENES = (
     (2104, DARK, 59, ""),
     (2106, DARK, 225, "night"),
 )
-LAYOUTS = {20: ColumnLayout(), 100: ColumnLayout(100, 0.5)}
+LAYOUTS = {20: ColumnLayout(20, 0.45, 16 / 9), 100: ColumnLayout(100, 0.5, 16 / 9)}
 #: A grid counts if its columns are this near to the true ones: mean and largest distance.
 NEAR = (0.2, 0.6)
 #: Weight of the pull towards the weights of before, and those that are fitted.
-PULL, FREE = 0.5, ("hidden_unlit", "faint_on_border", "part_between")
+PULL, FREE = 0.5, ("hidden_unlit", "faint_on_border", "part_between", "part_in_middle")
 #: Share of pictures that are taken to leave out columns of one side, and their maximum share of the screen; parts of
 #: the scenes that are held out in turn.
 CUT_SHARE, MAX_CUT, FOLDS = 0.1, 0.25, 8
@@ -75,8 +75,7 @@ def features_of(scene: Scene, number: int) -> list[Features]:
     pixels = np.random.default_rng(number).uniform(0.9e6, 1.4e6) * (1 if n == 20 else 2)
     trial = simulate_trial(on_fewer_pixels(scene, pixels), number)
     plane = read_plane(trial.frame)
-    bright = bright_quadrilateral(plane)
-    parts = faint_quadrilaterals(plane) + ([] if bright is None else [bright])
+    parts = [part for part in bright_parts(plane) if part is not None]
     screens = find_screens(plane, [LAYOUTS[n]], None, parts)
     outline = screens[0][0] if screens else None
     if outline is None or outline.grid is None or outline.strips is None:
@@ -95,7 +94,7 @@ def features_of(scene: Scene, number: int) -> list[Features]:
     light, rng = light_profile(strips, predicted, grid, parts), np.random.default_rng([number, 5])
     found = []
     for one in (light, cut(light, first, n, rng), cut(light, first, n, rng)):
-        starts, terms, _ = first_column_features(one, n)
+        starts, terms, _ = first_column_features(one, n, LAYOUTS[n].aspect)
         found += [(terms, int(index)) for index in np.flatnonzero(starts == first)]
     return found
 
@@ -106,9 +105,10 @@ def cut(light: LightProfile, first: int, n: int, rng: np.random.Generator) -> Li
     low, high = (first + left_out, shown.max()) if rng.random() < 0.5 else (shown.min(), first + n - left_out)
     inside = (light.place > low) & (light.place < high)
     values = {name: getattr(light, name) * inside for name in ("in_picture", "coherent", "level", "steady", "faint")}
-    sides = light.sides[(light.sides[:, 0] > low) & (light.sides[:, 1] < high)]
+    whole = (light.sides[:, 0] > low) & (light.sides[:, 1] < high)
+    parts = {"sides": light.sides[whole], "heights": light.heights[whole]}
     middle = (max(low, shown.min()) + min(high, shown.max())) / 2
-    return replace(light, **values, is_faint=light.is_faint & inside, picture_middle=middle, sides=sides)
+    return replace(light, **values, is_faint=light.is_faint & inside, picture_middle=middle, **parts)
 
 
 def fitted(scenes: list[list[Features]]) -> np.ndarray:

@@ -291,7 +291,7 @@ def _numbered(
     stands_out = _stands_out(strips, grid)
     found: list[Outline] = []
     for family, layout in enumerate(layouts):
-        columns, odds, fills = first_columns(profile, layout.n_columns)
+        columns, odds, fills = first_columns(profile, layout.n_columns, layout.aspect)
         best, n = int(columns[odds.argmax()]), layout.n_columns
         own = moved_by_waveforms(strips, grid.shifted(best), layout.sigma, _LAST_STEPS, n_columns=n)
         axis, ends, has_bars = find_rows(strips, light, own, n, layout.aspect)
@@ -340,7 +340,7 @@ def _across_gap(
     odds = []
     for rival in grids:
         _, profile = _light_across(strips, rival, layout.sigma, parts)
-        _, numbers, _ = first_columns(profile, layout.n_columns)
+        _, numbers, _ = first_columns(profile, layout.n_columns, layout.aspect)
         odds.append(_SCORE_ODDS * _score(rival) + np.logaddexp.reduce(numbers))
     best = int(np.argmax(odds))
     return grids[best], float(1 / np.exp(np.array(odds) - odds[best]).sum())

@@ -14,6 +14,7 @@ import numpy as np
 
 from rxcli.numerics import TINY, best_run
 from rxcli.receiver.screen.grid import Grid, columns_at
+from rxcli.receiver.screen.rows import ScreenAxis
 from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.resources import data_dir
 from rxcli.types import BoolArray, Float32Array, FloatArray, IntArray
@@ -33,8 +34,9 @@ _ENDS, _IN_VIEW = 0.15, 0.3
 #: Share of the parts that are the darkest, or the brightest; parts are faint up to a share of the way from these to
 #: those, of the root of light; minimum standard deviation of it, of white.
 _DARK, _FAINT, _MIN_FAINT_SD = 0.1, 0.05, 0.0004
-#: Standard deviation of the sides of a bright part against the screen's, screen widths.
-_SIDE_SD = 0.0125
+#: Standard deviations of the sides of a bright part against the screen's, screen widths, and of its height, screen
+#: heights.
+_SIDE_SD, _HEIGHT_SD = 0.0125, 0.03
 #: Distances from the screen's middle, screen widths, within which edges lie that it has in pairs: of films and of the
 #: screen's frame.
 _PAIRED = (0.22, 0.58)
@@ -44,8 +46,8 @@ _MIN_SHOWN = 3
 
 #: Features of a first column in their order; the comments in `models/numbering/model.toml` explain them.
 WEIGHTS = (
-    *("lit_inside", "unlit_inside", "steady_inside", "light_off_middle", "picture_off_middle", "hidden_unlit"),
-    *("columns_on_border", "light_on_border", "faint_on_border", "paired_edges", "part_between"),
+    *("lit_inside", "unlit_inside", "steady_inside", "picture_off_middle", "hidden_unlit", "columns_on_border"),
+    *("light_on_border", "faint_on_border", "paired_edges", "part_between", "part_in_middle"),
 )
 
 
@@ -74,8 +76,9 @@ class LightProfile:
     faint: FloatArray
     #: Column at the picture's middle.
     picture_middle: float
-    #: (Q, 2) columns at the left and the right of bright parts with four straight sides.
+    #: (Q, 2) columns at the left and the right of bright parts with four straight sides; (Q,) their heights, columns.
     sides: FloatArray
+    heights: FloatArray
 
     @property
     def light(self) -> FloatArray:
@@ -133,10 +136,13 @@ def light_profile(
     usual = np.median(of_columns) if of_columns.size else np.inf
     steady = np.clip(darkest - usual, 0, _MAX_STEADY) * (1 - coherent) * shown
     place = origin + (np.arange(n) + 0.5) / _PARTS
-    corners = grid.columns_at(np.reshape(parts, (-1, 4, 2)))
-    sides = np.stack([corners[:, [0, 3]].mean(axis=1), corners[:, [1, 2]].mean(axis=1)], axis=1)
+    corners = np.reshape(parts, (-1, 4, 2))
+    across = grid.columns_at(corners)
+    sides = np.stack([across[:, [0, 3]].mean(axis=1), across[:, [1, 2]].mean(axis=1)], axis=1)
+    along = ScreenAxis.through(grid, 1, 1.0, 0.0).along(*grid.flat(corners))
+    heights = along[:, 2:].mean(axis=1) - along[:, :2].mean(axis=1)
     middle = float(grid.coefficients[0])
-    return LightProfile(place, count > 0, coherent, level, steady, is_faint, faint, middle, sides)
+    return LightProfile(place, count > 0, coherent, level, steady, is_faint, faint, middle, sides, heights)
 
 
 def _lit_rows(strips: PictureStrips, light: Float32Array) -> BoolArray:
@@ -161,24 +167,24 @@ def _faint_light(root: FloatArray, shown: BoolArray) -> tuple[BoolArray, FloatAr
     return is_faint, np.where(is_faint, root, 0) / plain
 
 
-def first_columns(light: LightProfile, n_columns: int) -> tuple[IntArray, FloatArray, bool]:
+def first_columns(light: LightProfile, n_columns: int, aspect: float) -> tuple[IntArray, FloatArray, bool]:
     """Columns (F,) of a grid, the log-odds of each to be the screen's first, and whether no side of it is in view.
 
     If columns are dark at both ends and nothing else shows its sides, several candidates remain about equally likely.
     Log-odds are comparable between numbers of columns.
     """
-    starts, terms, fills = first_column_features(light, n_columns)
+    starts, terms, fills = first_column_features(light, n_columns, aspect)
     return starts, terms @ numbering_weights(), fills
 
 
-def first_column_features(light: LightProfile, n_columns: int) -> tuple[IntArray, FloatArray, bool]:
+def first_column_features(light: LightProfile, n_columns: int, aspect: float) -> tuple[IntArray, FloatArray, bool]:
     """Columns (F,) of a grid, their features (F, 11) in the order of the weights, and whether no side is in view."""
     shown = light.place[light.in_picture]
     left, right = float(shown.min()), float(shown.max())
     n_shown = min(n_columns, _MIN_SHOWN)
     leftmost = int(left) - n_columns + n_shown
     starts = np.arange(leftmost, max(int(right) - n_shown, leftmost) + 1)
-    ends, middles = starts + n_columns, starts + n_columns / 2
+    ends, middles = starts + n_columns, np.asarray(starts + n_columns / 2, np.float64)
     begin, end_of_light = light.ends
     reaches = np.array([begin < left + _IN_VIEW, end_of_light > right - _IN_VIEW])
     # Parts next to a border count for neither side.
@@ -190,18 +196,19 @@ def first_column_features(light: LightProfile, n_columns: int) -> tuple[IntArray
     brightens, fades = light.edges(light.faint, light.is_faint)
     border, width = ((starts - light.place[0]) * _PARTS + 0.5).round().astype(np.int64), n_columns * _PARTS
     # Light that goes on outside the picture has its middle anywhere.
-    off_middle = np.abs(np.array([[(begin + end_of_light) / 2], [light.picture_middle]]) - middles) / n_columns
+    off_middle = np.abs(light.picture_middle - middles) / n_columns * (not reaches.any())
     terms = (
         inside @ light.light,
         inside @ (1 - light.coherent),
         inside @ light.steady / n_columns,
-        *(off_middle * (not reaches.any())),
+        off_middle,
         ~reaches @ hidden,
         _at(begins, border) + _at(ceases, border + width),
         _at(rises, border) + _at(falls, border + width),
         _at(brightens, border) + _at(fades, border + width),
         _paired(rises, falls, border + width // 2, width),
         _between(light.sides, np.stack([starts, ends], axis=1) / n_columns, n_columns),
+        _in_middle(light, middles, n_columns, aspect),
     )
     # Light across more columns than the screen has is not all the columns'.
     fills = bool(reaches.all()) and right - left < n_columns
@@ -212,6 +219,13 @@ def _between(sides: FloatArray, screens: FloatArray, n_columns: int) -> FloatArr
     """(F,) 0..1: how near the sides (Q, 2) of any bright part, columns, are to those of screens (F, 2), widths."""
     off = (sides[:, None] / n_columns - screens) / _SIDE_SD
     return np.asarray(np.exp(-0.5 * np.square(off).sum(axis=2)).max(axis=0, initial=0.0))
+
+
+def _in_middle(light: LightProfile, middles: FloatArray, n_columns: int, aspect: float) -> FloatArray:
+    """(F,) 0..1: how near the middle of a bright part as high as the screen, as of a film, is to the screen's."""
+    off = (light.sides.mean(axis=1)[:, None] - middles) / n_columns / (_SIDE_SD / 2)
+    missing = (light.heights[:, None] * aspect / n_columns - 1) / _HEIGHT_SD
+    return np.asarray(np.exp(-0.5 * (off**2 + missing**2)).max(axis=0, initial=0.0))
 
 
 def _paired(rises: FloatArray, falls: FloatArray, middle: IntArray, width: int) -> FloatArray:

@@ -190,8 +190,9 @@ class PictureStrips:
     def gap(self, least: float) -> tuple[int, int]:
         """First and last strip of the widest gap without coherent light, with a share of it of `least` on each side."""
         lit = self.coherence.mean(axis=0)
-        share = np.cumsum(lit) / (lit.sum() + np.float32(TINY))
         is_dark = lit < _GAP_LIGHT * np.quantile(lit, 0.9)
+        # What dark strips have in common is noise of rows.
+        share = np.cumsum(lit * ~is_dark) / ((lit * ~is_dark).sum() + np.float32(TINY))
         is_dark[(share < least) | (share > 1 - least)] = False
         edges = np.flatnonzero(np.diff(np.concatenate([[False], is_dark, [False]]).astype(np.int8))).reshape(-1, 2)
         start, end = max(edges.tolist(), key=lambda gap: gap[1] - gap[0], default=(0, 0))

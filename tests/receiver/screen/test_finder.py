@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rxcli.receiver.plane import read_plane
 from rxcli.receiver.screen import find, geometry
+from rxcli.receiver.screen.bright import bright_parts
 from rxcli.receiver.screen.combs import find_combs
 from rxcli.receiver.screen.find import (
     ColumnLayout,
@@ -119,8 +120,9 @@ def plane_of(pixels: NDArray[Any]) -> LightPlane:
 
 
 def find_outlines(plane: LightPlane, layouts: list[ColumnLayout], lens: Lens | None = None) -> list[Outline]:
-    """Outlines of the clearest screen, likeliest first."""
-    return next(iter(find_screens(plane, layouts, lens)), [])
+    """Outlines of the clearest screen, likeliest first, with the bright parts that the receiver looks for."""
+    parts = [part for part in bright_parts(plane) if part is not None] if plane.width else []
+    return next(iter(find_screens(plane, layouts, lens, parts)), [])
 
 
 @lru_cache(maxsize=8)
@@ -401,7 +403,7 @@ def test_a_film_has_sharp_edges_and_fading_light_has_none() -> None:
     borders = light.place - 1 / 16
     np.testing.assert_allclose([borders[edge[:-1] > 0.9].mean() for edge in (rises, falls)], (2.6, 17.4), atol=0.1)
     assert max(edge.max() for edge in profile_of("fading").edges(profile_of("fading").level)) < 0.5
-    columns, log_odds, _ = first_columns(light, 20)
+    columns, log_odds, _ = first_columns(light, 20, ASPECT)
     assert columns[log_odds.argmax()] == 0
 
 
@@ -411,12 +413,13 @@ def profile(start: float, end: float, *, film: tuple[float, float] | None = None
     coherent = ((place > start) & (place < end)).astype(np.float64)
     level = coherent if film is None else ((place > film[0]) & (place < film[1])).astype(np.float64)
     none = np.zeros(place.size)
-    return LightProfile(place, np.ones(place.size, bool), coherent, level, none, none > 0, none, 10.0, np.zeros((0, 2)))
+    parts = np.zeros((0, 2)), np.zeros(0)
+    return LightProfile(place, np.ones(place.size, bool), coherent, level, none, none > 0, none, 10.0, *parts)
 
 
 @pytest.mark.parametrize("film", [(2.75, 17.25), (2.5, 16.25)])
 def test_bars_of_equal_width_on_both_sides_show_the_first_column(film: tuple[float, float]) -> None:
-    columns, log_odds, _ = first_columns(profile(2.5, 17.5, film=film), 20)
+    columns, log_odds, _ = first_columns(profile(2.5, 17.5, film=film), 20, ASPECT)
     certainty = 1 / np.exp(log_odds - log_odds.max()).sum()
     is_plain = certainty > 0.8 and columns[log_odds.argmax()] == 0
     assert is_plain == (sum(film) == 20)
@@ -426,17 +429,25 @@ def test_bars_of_equal_width_on_both_sides_show_the_first_column(film: tuple[flo
 def test_the_little_light_that_a_dark_panel_passes_shows_the_first_column(first: int) -> None:
     light = profile(7, 13)
     inside = (light.place > first) & (light.place < first + 20)
-    columns, log_odds, _ = first_columns(replace(light, is_faint=light.coherent == 0, faint=0.4 * inside), 20)
+    columns, log_odds, _ = first_columns(replace(light, is_faint=light.coherent == 0, faint=0.4 * inside), 20, ASPECT)
     assert columns[log_odds.argmax()] == first
 
 
 @pytest.mark.parametrize("off", [0.0, 0.2, 0.9])
 def test_a_part_with_the_sides_of_a_screen_shows_the_first_column(off: float) -> None:
     sides = np.array([[4.0, 15.0], [1.0 + off, 21.0 + off]])
-    columns, log_odds, _ = first_columns(replace(profile(7, 13), sides=sides), 20)
+    columns, log_odds, _ = first_columns(replace(profile(7, 13), sides=sides, heights=np.zeros(2)), 20, ASPECT)
     certainty = 1 / np.exp(log_odds - log_odds.max()).sum()
     assert columns[log_odds.argmax()] == round(1 + off)
     assert certainty > 0.9
+
+
+@pytest.mark.parametrize("height", [9.0, 11.25])
+def test_a_part_as_high_as_the_screen_lies_in_its_middle(height: float) -> None:
+    light = replace(profile(4, 14), sides=np.array([[4.0, 14.0]]), heights=np.array([height]))
+    columns, log_odds, _ = first_columns(light, 20, ASPECT)
+    certainty = 1 / np.exp(log_odds - log_odds.max()).sum()
+    assert (columns[log_odds.argmax()] == -1 and certainty > 0.8) == (height == 11.25)
 
 
 @pytest.mark.parametrize(("step", "is_plain"), [(1.5, True), (0.1, False)])
@@ -459,23 +470,23 @@ def test_steady_light_around_the_screen_shows_the_first_column() -> None:
 
 
 def test_light_that_ends_just_before_the_edge_of_the_picture_ends_on_the_screen() -> None:
-    columns, log_odds, fills = first_columns(profile(7, 20, right=20.4), 20)
+    columns, log_odds, fills = first_columns(profile(7, 20, right=20.4), 20, ASPECT)
     assert columns[log_odds.argmax()] == 0
     assert not fills
 
 
 def test_light_across_more_columns_than_a_screen_has_does_not_fill_the_picture_with_it() -> None:
-    assert [first_columns(profile(-2, right, right=right), 20)[2] for right in (17.5, 22.0)] == [True, False]
+    assert [first_columns(profile(-2, right, right=right), 20, ASPECT)[2] for right in (17.5, 22.0)] == [True, False]
 
 
 def test_a_side_counts_as_hidden_by_the_share_of_a_column_outside_the_picture() -> None:
-    columns, features, _ = first_column_features(profile(7, 13, right=19.625), 20)
+    columns, features, _ = first_column_features(profile(7, 13, right=19.625), 20, ASPECT)
     hidden = dict(zip(columns.tolist(), features[:, WEIGHTS.index("hidden_unlit")].tolist(), strict=True))
     assert [round(hidden[first], 2) for first in (-3, -2, -1, 0, 1)] == [1, 0.06, 0, 0.44, 1]
 
 
 def test_the_shipped_weights_are_those_of_the_features() -> None:
-    assert len(numbering_weights()) == first_column_features(profile(2, 18), 20)[1].shape[1]
+    assert len(numbering_weights()) == first_column_features(profile(2, 18), 20, ASPECT)[1].shape[1]
 
 
 def test_light_ends_where_bars_begin_and_takes_no_more_than_a_screen() -> None:
