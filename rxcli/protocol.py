@@ -44,6 +44,13 @@ def codebook(w: int) -> NDArray[np.uint8]:
     return words
 
 
+@cache
+def codewords() -> tuple[NDArray[np.uint8], list[int]]:
+    """(n, 10) uint8 codewords of all weights, one codebook after the other, and the first word of each."""
+    books = [codebook(w) for w in WEIGHTS]
+    return np.concatenate(books), np.cumsum([0, *map(len, books[:-1])]).tolist()
+
+
 def slot_patterns(isi_memory: int) -> NDArray[np.uint8]:
     """(2**(memory+1), memory+1) uint8 patterns of a slot and its `isi_memory` predecessors, the slot itself last."""
     values = np.arange(1 << (isi_memory + 1))

@@ -268,7 +268,10 @@ class Clock:
 
     def by_burst(self, slots: NDArray[Any]) -> NDArray[Any]:
         """(B, C, packet_slots) grid values (C, N) added over the copies of each burst."""
-        copies = self.to_copies(slots)
+        return self.added(self.to_copies(slots))
+
+    def added(self, copies: NDArray[Any]) -> NDArray[Any]:
+        """(B, C, ...) values (C, n_copies, ...) added over the copies of each burst."""
         return np.stack([copies[:, self.burst == burst].sum(axis=1) for burst in range(int(self.burst.max()) + 1)])
 
     def on_grid(self, slots: NDArray[Any]) -> NDArray[Any]:

@@ -89,9 +89,9 @@ def decode(
     # Joint detection gives no slots by themselves, and developing mixes rows that are few per slot.
     by_slot = adds_up or initial.clock.rows_per_slot < STILL.min_joint_rows
     if lit.size and by_slot and not initial.is_long:
-        reception, _ = without_row_noise(acquisition, reception, lit)
+        reception, *_ = without_row_noise(acquisition, reception, lit)
         if (doubtful := np.intersect1d(lit, doubtful_columns(reception))).size:
-            reception, _ = without_row_noise(acquisition, reception, doubtful)
+            reception, *_ = without_row_noise(acquisition, reception, doubtful)
     elif lit.size:
         # Noise of rows is estimated from the slots: again once these are better.
         for _ in range(1 + (acquisition.profiles.has_row_noise and not initial.is_long)):
@@ -110,7 +110,7 @@ def _with_tails(acquisition: Acquisition, initial: Reception) -> Reception:
         return initial
     model = initial.model.with_tails(light_spread, tails)
     found = channel.slot_likelihoods(initial.samples, initial.clock, model, lit, columns, is_initial=True)
-    return replace(_with_llr(initial, columns, found.llr, found.snr), model=model)
+    return replace(_with_slots(initial, columns, found), model=model)
 
 
 def initial_pass(acquisition: Acquisition, room_light: float = 1.0) -> Reception:
@@ -394,25 +394,26 @@ def doubtful_columns(reception: Reception) -> NDArray[np.int64]:
 
 def without_row_noise(
     acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]
-) -> tuple[Reception, denoise.DenoiserInput]:
-    """Slots of some columns on the fine grid after removal of row noise; and the input of the auto-encoder."""
+) -> tuple[Reception, denoise.DenoiserInput, channel.SlotLikelihoods]:
+    """Slots of some columns on the fine grid without row noise: detected, for the auto-encoder, and by themselves."""
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), denoise.SAMPLES_PER_SLOT)
     lit = reception.clock.on_grid(reception.posteriors.lit)
     whole = model.expected(lit, reception.clock, np.arange(len(lit))).whole
     samples = denoise.remove_row_noise(samples, whole, model)
-    likelihoods = channel.slot_likelihoods(samples.of_columns(columns), reception.clock, model, lit, columns)
-    by_slot = _with_llr(reception, columns, likelihoods.llr, likelihoods.snr)
-    return by_slot, by_slot.scene_of(samples, model)
+    slots = channel.slot_likelihoods(samples.of_columns(columns), reception.clock, model, lit, columns)
+    by_slot = _with_slots(reception, columns, slots)
+    return by_slot, by_slot.scene_of(samples, model), slots
 
 
-def _with_llr(reception: Reception, columns: NDArray[np.int64], llr: Float32Array, snr: Float32Array) -> Reception:
+def _with_slots(reception: Reception, columns: NDArray[np.int64], slots: channel.SlotLikelihoods) -> Reception:
     """Replace the slots of some columns and detect their words again."""
-    of_all, snr_of_all = reception.llr.copy(), reception.snr.copy()
-    of_all[columns], snr_of_all[columns] = llr, snr
-    posteriors = reception.posteriors.with_columns(columns, detected(llr, reception.clock))
+    llr, snr = reception.llr.copy(), reception.snr.copy()
+    llr[columns], snr[columns] = slots.llr, slots.snr
+    found = detected(slots.llr, reception.clock, words=slots.words)
+    posteriors = reception.posteriors.with_columns(columns, found)
     joint = reception.joint.copy()
     joint[columns] = False
-    return replace(reception, llr=of_all, snr=snr_of_all, posteriors=posteriors, joint=joint)
+    return replace(reception, llr=llr, snr=snr, posteriors=posteriors, joint=joint)
 
 
 def _view(
@@ -452,13 +453,13 @@ def apply_autoencoder(
     if options.cae == "never" or columns.size == 0 or reception.is_long:
         return reception, frozenset(), None
     report: dict[str, Any] = {"model": denoise.DEFAULT_MODEL, "columns": columns.size, "kept": 0}
-    by_slot, scene = without_row_noise(acquisition, reception, columns)
+    by_slot, scene, slots = without_row_noise(acquisition, reception, columns)
     try:
         denoiser = options.denoiser or _denoiser()
         corrections = denoiser.slot_corrections(scene, columns)
     except ReceiverError as error:
         return reception, frozenset(), {**report, "columns": 0, "message": str(error)}
-    after = _with_llr(by_slot, columns, by_slot.llr[columns] + corrections, by_slot.snr[columns])
+    after = _with_slots(by_slot, columns, replace(slots, llr=slots.llr + corrections))
     surest = after.best_confidence(frozenset(columns.tolist()))
     is_surer = surest > np.maximum(reception.best_confidence(), STILL.min_corrected_confidence)
     improved = columns[is_surer[columns]]
@@ -490,9 +491,16 @@ def in_bursts(acquisition: Acquisition, clock: Clock, llr: Float32Array) -> Cloc
     return sync.possible_bursts(clock, llr, acquisition.repeats)[0][0]
 
 
-def detected(llr: Float32Array, clock: Clock, weights: BoolArray | None = None) -> BurstPosteriors:
-    """Detect the packets of a clock from log-likelihood ratios (C, N) of the grid; see `detect.detect`."""
-    found = detect.detect(clock.by_burst(llr), weights)
+def detected(
+    llr: Float32Array, clock: Clock, weights: BoolArray | None = None, words: Float32Array | None = None
+) -> BurstPosteriors:
+    """Detect the packets of a clock from log-likelihood ratios (C, N) of the grid; see `detect.detect`.
+
+    `words` is (C, copies, symbols, n), see `channel.SlotLikelihoods`.
+    """
+    if words is not None:
+        words = channel.of_words(clock.added(words)[:, :, PREAMBLE_SLOTS // SLOTS_PER_SYMBOL :])
+    found = detect.detect(clock.by_burst(llr), weights, words)
     free = detect.free_log_evidence(llr, found.w / SLOTS_PER_SYMBOL) + np.log(len(WEIGHTS))
     return replace(found, log_evidence=found.log_evidence - free)
 

@@ -118,7 +118,7 @@ def _simulated(simulated: SimulatedScene, seed: int) -> Sample | None:
     columns = doubtful_columns(reception)
     if reception.is_long or not columns.size:
         return None
-    _, scene = without_row_noise(found.best.acquisition, reception, columns)
+    _, scene, _ = without_row_noise(found.best.acquisition, reception, columns)
     slots = sent_slots(trial.capture.exposure, scene.clock)
     if not _headers_fit(slots, scene.clock):
         return None

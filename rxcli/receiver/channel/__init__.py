@@ -18,12 +18,13 @@ The prediction of the picture needs the slots, so model and detection are iterat
 sample with its local extremes.
 
 `model` holds the parameters of a frame, `steady` takes off light that does not blink, `picture` predicts the picture,
-`likelihoods` computes metrics, and `patterns` turns these into ratios of slots.
+`likelihoods` computes metrics, and `patterns` turns these into ratios of slots, and of words what samples of several
+slots add to these.
 """
 
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods
 from rxcli.receiver.channel.model import ObservationModel, estimate_black_level, estimate_tails
-from rxcli.receiver.channel.patterns import initial_llr, lit_of, llr_of
+from rxcli.receiver.channel.patterns import initial_llr, lit_of, llr_of, of_words
 from rxcli.receiver.channel.steady import without_steady_light
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "initial_llr",
     "lit_of",
     "llr_of",
+    "of_words",
     "slot_likelihoods",
     "without_steady_light",
 ]

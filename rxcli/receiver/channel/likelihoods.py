@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rxcli.numerics import MIN_FLOAT32
 from rxcli.receiver.channel.model import Expected, ObservationModel
-from rxcli.receiver.channel.patterns import by_pattern, slot_llr
+from rxcli.receiver.channel.patterns import by_pattern, propagated, word_metrics
 from rxcli.receiver.channel.picture import PER_SLOT, PictureSums, Prediction, by_place, predict_picture
 from rxcli.receiver.channel.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, SlotSamples
@@ -29,6 +29,8 @@ class SlotLikelihoods:
     #: (C, 2) float64: correlation of the residuals with their derivative by time, and power of that derivative; their
     #: ratio is the lateness of the column's clock in slots. Empty but for an initial pass.
     timing: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    #: (C, copies, symbols, n) see `word_metrics`; None: words are known by their slots alone.
+    words: Float32Array | None = None
 
 
 def slot_likelihoods(
@@ -57,8 +59,10 @@ def slot_likelihoods(
     sums = PictureSums.of(observed.light, observed.whole, observed.valid)
     prediction = predict_picture(sums, model.noise.dark_variance, scales, one_sided=not is_initial)
     late = np.zeros((0, 2)) if observed.slope is None else _timing(observed, observed.slope, prediction)
-    llr = slot_llr(_pattern_metrics(observed, prediction), None if is_initial else lit[columns])
-    return SlotLikelihoods(llr, _slot_snr(observed, prediction), late)
+    metrics = _pattern_metrics(observed, prediction)
+    llr, odds = propagated(metrics, None if is_initial else lit[columns])
+    words = None if is_initial else word_metrics(metrics, llr, odds, clock)
+    return SlotLikelihoods(llr, _slot_snr(observed, prediction), late, words)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,13 +3,14 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from itertools import count
 
 import numpy as np
 
 from rxcli.numerics import MIN_FLOAT32
-from rxcli.protocol import slot_patterns
+from rxcli.protocol import SLOTS_PER_SYMBOL, codewords, slot_patterns
 from rxcli.receiver.light import Exposure
-from rxcli.types import Float32Array
+from rxcli.types import Clock, Float32Array
 
 #: Passes over the slots, each with the neighbours as the pass before has them.
 _PASSES = 3
@@ -30,7 +31,13 @@ def lit_of(llr: Float32Array) -> Float32Array:
 
 
 def slot_llr(metrics: Float32Array, lit: Float32Array | None = None) -> Float32Array:
-    """(C, N) log-likelihood ratio of each slot being lit by its own light.
+    """(C, N) log-likelihood ratio of each slot being lit by its own light; see `propagated`."""
+    llr, _ = propagated(metrics, lit)
+    return llr
+
+
+def propagated(metrics: Float32Array, lit: Float32Array | None = None) -> tuple[Float32Array, Float32Array]:
+    """Log-likelihood ratios of slots being lit by their own light.
 
     A slot contributes to its own metric and to the `isi_memory` metrics after it; their ratios are added. A metric's
     ratio for a slot takes the other slots from the other metrics alone (belief propagation), so that none counts twice.
@@ -38,6 +45,9 @@ def slot_llr(metrics: Float32Array, lit: Float32Array | None = None) -> Float32A
     Args:
         metrics: (C, N + memory, patterns) log-likelihood of every pattern of slots n - memory .. n.
         lit: (C, N) probability that each slot is lit, as far as it concerns its neighbours; None: by their own light.
+
+    Returns:
+        (C, N) of each slot; and (memory + 1, C, N + memory) of the slot `age` slots ago, as the other metrics have it.
     """
     isi_memory = int(metrics.shape[-1]).bit_length() - 2
     n_columns, n_metrics, n_patterns = metrics.shape
@@ -51,8 +61,12 @@ def slot_llr(metrics: Float32Array, lit: Float32Array | None = None) -> Float32A
         llr[:, isi_memory:n_metrics] = llr_of(lit)
     of_age = [slice(isi_memory - age, isi_memory - age + n_metrics) for age in range(isi_memory + 1)]
     gained = np.zeros((isi_memory + 1, n_columns, n_metrics), np.float32)
+
+    def odds_of(llr: Float32Array, gained: Float32Array) -> Float32Array:
+        return np.asarray(np.clip(np.stack([llr[:, part] for part in of_age]) - gained, -_MAX_LLR, _MAX_LLR))
+
     for _ in range(_PASSES if lit is None else 1):
-        odds = np.clip(np.stack([llr[:, part] for part in of_age]) - gained, -_MAX_LLR, _MAX_LLR)
+        odds = odds_of(llr, gained)
         likelihood = is_lit.T @ odds.reshape(isi_memory + 1, -1)
         likelihood += by_pattern
         likelihood -= likelihood.max(axis=0)
@@ -62,7 +76,55 @@ def slot_llr(metrics: Float32Array, lit: Float32Array | None = None) -> Float32A
         llr = np.zeros_like(llr)
         for part, values in zip(of_age, gained, strict=True):
             llr[:, part] += values
-    return llr[:, isi_memory:n_metrics]
+    return llr[:, isi_memory:n_metrics], odds_of(llr, gained)
+
+
+def word_metrics(metrics: Float32Array, llr: Float32Array, odds: Float32Array, clock: Clock) -> Float32Array:
+    """Log-likelihood of slot patterns in words beyond the ratios of their slots, as samples see several slots at once.
+
+    The metrics at the ends of a word are averaged over the slots of adjacent words.
+
+    Args:
+        metrics, llr, odds: see `propagated`.
+        clock: of their N slots.
+
+    Returns:
+        (C, copies, symbols, (10 + memory) * patterns), see `of_words`.
+    """
+    n, isi_memory = SLOTS_PER_SYMBOL, len(odds) - 1
+
+    def by_symbol(values: Float32Array) -> Float32Array:
+        out = np.zeros((*values.shape[:-1], clock.n_copies * clock.packet_slots + isi_memory), np.float32)
+        out[..., clock.first_slot : clock.first_slot + values.shape[-1]] = values
+        return np.lib.stride_tricks.sliding_window_view(out, n + isi_memory, axis=-1)[..., ::n, :]
+
+    is_lit, age = _lit_by_age(isi_memory), np.arange(isi_memory + 1)
+    by_pattern = by_symbol(np.moveaxis(metrics, -1, 0)).copy()
+    by_pattern[is_lit[0] > 0, ..., :n] -= by_symbol(llr)[..., :n]
+    adjacent = by_symbol(odds)
+    for place in (*range(isi_memory), *range(n, n + isi_memory)):
+        beyond = (age > place) | (age <= place - n)
+        own = by_pattern[..., place] + np.tensordot(is_lit[beyond], adjacent[beyond, ..., place], (0, 0))
+        top = own.max(axis=0)
+        agree = (is_lit[~beyond, :, None] == is_lit[~beyond, None]).all(axis=0).astype(np.float32)
+        by_pattern[..., place] = top + np.log(np.tensordot(agree, np.exp(own - top), 1) + MIN_FLOAT32)
+    return np.moveaxis(by_pattern, 0, -1).reshape(len(llr), clock.n_copies, clock.packet_slots // n, -1)
+
+
+def of_words(metrics: Float32Array) -> Float32Array:
+    """(..., words) log-likelihood of the words in `codewords` beyond that of their slots, from `word_metrics`."""
+    isi_memory = next(memory for memory in count() if (SLOTS_PER_SYMBOL + memory) << (memory + 1) == metrics.shape[-1])
+    return np.asarray(metrics @ _word_patterns(isi_memory))
+
+
+@cache
+def _word_patterns(isi_memory: int) -> Float32Array:
+    """((10 + memory) * patterns, words): 1 where a metric has a pattern; adjacent slots do not count and are dark."""
+    slots = np.pad(codewords()[0].astype(np.int64), ((0, 0), (isi_memory, isi_memory)))
+    windows = np.lib.stride_tricks.sliding_window_view(slots, isi_memory + 1, axis=1)
+    number = windows @ (1 << np.arange(isi_memory, -1, -1))
+    has_pattern = number.T[:, None] == np.arange(2 << isi_memory)[:, None]
+    return np.asarray(has_pattern.reshape(-1, len(slots)), np.float32)
 
 
 @cache

@@ -1,12 +1,12 @@
 """Maximum-likelihood detection of MPPM symbols, soft.
 
 The input is the log-likelihood ratio of every slot, added over the copies of a packet: the channel has resolved
-inter-symbol interference. The likelihood of a word is then the product of those of its slots. Header and dimming symbol
-are known once the weight `w` is, so the sum over all words is the evidence for `w`.
+inter-symbol interference. The likelihood of a word is then the product of those of its slots, and of what a sample of
+several slots adds to it. Header and dimming symbol are known once the weight `w` is, so the sum over all words is the
+evidence for `w`.
 """
 
 from collections.abc import Callable
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from rxcli.protocol import (
     WEIGHTS,
     bits_per_symbol,
     codebook,
+    codewords,
     dimming_symbol,
 )
 from rxcli.receiver.decode.settings import SETTINGS
@@ -28,27 +29,33 @@ from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, In
 MAX_BITS = max(map(bits_per_symbol, WEIGHTS))
 
 
-def detect(llr: Float32Array | FloatArray, candidates: BoolArray | None = None) -> BurstPosteriors:
+def detect(
+    llr: Float32Array | FloatArray, candidates: BoolArray | None = None, of_words: Float32Array | None = None
+) -> BurstPosteriors:
     """Detect weights and symbols of every burst and column.
 
     Args:
         llr: (B, C, packet) log-likelihood ratio of each slot, copies added.
         candidates: (C, 9) weights to consider, all by default.
+        of_words: (B, C, payload symbols, words) log-likelihood of the words in `codewords` beyond that of their slots.
     """
     n_bursts, n_columns, _ = llr.shape
     payload = np.asarray(llr[..., PREAMBLE_SLOTS:], np.float32).reshape(n_bursts, n_columns, -1, SLOTS_PER_SYMBOL)
-    words, starts = _books()
-    score = payload @ words.T
+    words, starts = codewords()
+    score = payload @ words.T.astype(np.float32)
     top = score.max(axis=-1, keepdims=True)
     by_weight = np.add.reduceat(np.exp(score - top), starts, axis=-1)
     # Against dark slots, all bursts together.
-    of_words = np.log(np.maximum(by_weight, MIN_FLOAT32)) + top - np.log(np.diff([*starts, len(words)]))
-    w_log_evidence = of_words.sum(axis=(0, 2), dtype=np.float64)
+    by_symbol = np.log(np.maximum(by_weight, MIN_FLOAT32)) + top - np.log(np.diff([*starts, len(words)]))
+    w_log_evidence = by_symbol.sum(axis=(0, 2), dtype=np.float64)
     for w in WEIGHTS:
         w_log_evidence[:, w - 1] += (llr[..., :PREAMBLE_SLOTS] @ preamble_slots(w)).sum(axis=0)
     if candidates is not None:
         w_log_evidence[~candidates] = -np.inf
     log_evidence = np.logaddexp.reduce(w_log_evidence, axis=1)
+
+    if of_words is not None:
+        score += of_words
 
     def posterior(w: int, columns: IntArray) -> FloatArray:
         own = score[:, columns, :, starts[w - 1] : starts[w - 1] + (1 << bits_per_symbol(w))].astype(np.float64)
@@ -113,13 +120,6 @@ def llr_of_bits(posterior: FloatArray, k: int) -> FloatArray:
     bits = (np.arange(1 << k)[:, None] >> np.arange(k - 1, -1, -1)) & 1
     p_one, p_zero = posterior @ bits, posterior @ (1 - bits)
     return np.asarray(np.log(np.maximum(p_one, MIN_FLOAT32)) - np.log(np.maximum(p_zero, MIN_FLOAT32)))
-
-
-@cache
-def _books() -> tuple[Float32Array, list[int]]:
-    """(words, 10) the codebooks of all weights, one after the other, and the first word of each."""
-    books = [codebook(w) for w in WEIGHTS]
-    return np.concatenate(books).astype(np.float32), np.cumsum([0, *map(len, books[:-1])]).tolist()
 
 
 def header_llr(llr: Float32Array | FloatArray) -> FloatArray:

@@ -9,9 +9,9 @@ from made_stages import clock_of
 from numpy.typing import NDArray
 from row_profiles import Link, Shot, random_link, row_profiles, sigma_of
 
-from rxcli.protocol import slot_patterns
+from rxcli.protocol import codewords, slot_patterns
 from rxcli.receiver import channel
-from rxcli.receiver.channel.patterns import by_pattern, slot_llr
+from rxcli.receiver.channel.patterns import by_pattern, of_words, propagated, slot_llr, word_metrics
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma
 from rxcli.receiver.sync import clock as sync
@@ -357,3 +357,22 @@ def test_ratios_of_slots_agree_with_enumeration_of_all_slots(seed: int) -> None:
     own = sequences[:, 1:-1]
     exact = np.log(likelihood @ own) - np.log(likelihood @ (1 - own))
     np.testing.assert_allclose(slot_llr(metrics)[0], exact, atol=0.06)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_words_agree_with_enumeration_of_all_slots(seed: int) -> None:
+    """Of a word with two slots of the next one in view, through exposures of up to two slots."""
+    n_slots = 12
+    metrics = np.random.default_rng(seed).normal(0, 2.0, (1, n_slots + 1, 4)).astype(np.float32)
+    sequences = np.array(list(product((0, 1), repeat=n_slots + 2)))
+    total = metrics[0, np.arange(n_slots + 1), 2 * sequences[:, :-1] + sequences[:, 1:]].sum(axis=1, dtype=np.float64)
+    words, _ = codewords()
+    number = sequences[:, 1:11] @ (1 << np.arange(10))
+    exact = np.log(np.bincount(number, np.exp(total))[words @ (1 << np.arange(10))])
+    clock = Clock(5.0, 1.0, 20, 0.0, n_slots, 0, np.zeros(1, np.int64), np.zeros(1), 10.0)
+    llr, odds = propagated(metrics)
+    found = llr[0, :10] @ words.T + of_words(word_metrics(metrics, llr, odds, clock))[0, 0, 0]
+    # The slots of the next word come from three passes, which is nearly exact; a constant does not matter.
+    np.testing.assert_allclose(found - found.mean(), exact - exact.mean(), atol=0.3)
+    by_slot = llr[0, :10] @ words.T
+    assert np.abs(by_slot - by_slot.mean() - exact + exact.mean()).max() > 1
