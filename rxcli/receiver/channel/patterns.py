@@ -113,7 +113,7 @@ def word_metrics(metrics: Float32Array, llr: Float32Array, odds: Float32Array, c
 
 def of_words(metrics: Float32Array) -> Float32Array:
     """(..., words) log-likelihood of the words in `codewords` beyond that of their slots, from `word_metrics`."""
-    isi_memory = next(memory for memory in count() if (SLOTS_PER_SYMBOL + memory) << (memory + 1) == metrics.shape[-1])
+    isi_memory = next(n for n in count() if (SLOTS_PER_SYMBOL + n) << (n + 1) == metrics.shape[-1])
     return np.asarray(metrics @ _word_patterns(isi_memory))
 
 
