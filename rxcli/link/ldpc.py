@@ -116,9 +116,11 @@ def quantised(llr: NDArray[np.floating]) -> NDArray[np.int8]:
     return np.asarray(np.clip(np.rint(llr / LLR_STEP), -_MAX_INPUT, _MAX_INPUT), np.int8)
 
 
-#: Iterations after which a block is given up as no codeword, and the least ratio of its share of unsatisfied checks to
-#: that after the first iteration at which it is.
-_PATIENCE, _MAX_RATIO = 6, 0.95
+#: Iterations after which a block whose checks do not agree with what was observed is given up: where most bits were
+#: observed, and elsewhere; what most are, and from which log-likelihood ratio a bit counts as observed, steps.
+_PATIENCE, _MOST, _OBSERVED = (2, 4), 0.65, 16
+#: Least agreement, standard deviations; arbitrary bits reach it one time in ten.
+_MIN_AGREEMENT, _MAX_PULL = 3.0, 80
 
 
 def decode(
@@ -136,7 +138,7 @@ def decode(
         code: the code.
         buffer_llr: (batch, M) int8: ln p(1)/p(0) in steps of `LLR_STEP` of the first M bits of the buffer, 0 unknown.
         accept: called after every iteration but the first with the hard decisions of each block.
-        max_iterations: maximum number of iterations; a block that looks like no codeword is given up earlier.
+        max_iterations: maximum number of iterations; a block that agrees with no checks is given up earlier.
         unsent_llr: (batch, first_sent) likewise of the bits that are never sent, if anything is known of them.
 
     Returns:
@@ -151,20 +153,20 @@ def decode(
     if unsent_llr is not None:
         total[: code.first_sent] = -unsent_llr.T
     layers, places, accepted = _Layers(code, n_rows, total), np.arange(batch), np.zeros(batch, bool)
+    patience = np.where((np.abs(buffer_llr) > _OBSERVED).mean(axis=1) > _MOST, *_PATIENCE)
     layers.update()
-    first_share = layers.unsatisfied()
     for iteration in range(2, max_iterations + 1):
         layers.update()
         good = [accept(*block) for block in zip(places.tolist(), layers.information(), strict=True)]
         accepted[places[good]] = True
         still = ~accepted[places]
-        if iteration == _PATIENCE:
-            still &= layers.unsatisfied() < _MAX_RATIO * first_share
+        if iteration in _PATIENCE:
+            still &= (patience[places] != iteration) | (layers.agreement() > _MIN_AGREEMENT)
         if not still.any():
             break
         if not still.all():
             layers.keep(still)
-            places, first_share = places[still], first_share[still]
+            places = places[still]
     return accepted
 
 
@@ -186,10 +188,11 @@ class _Layers:
 
     def __init__(self, code: Code, n_rows: int, total: NDArray[np.int16]) -> None:
         self._code, self._rows = code, _places(code)[:n_rows]
-        self._begin(total, [np.zeros((*row.shape, total.shape[1]), np.int16) for row in self._rows])
+        messages = [np.zeros((*row.shape, total.shape[1]), np.int16) for row in self._rows]
+        self._begin(total, total.copy(), messages)
 
-    def _begin(self, total: NDArray[np.int16], messages: list[NDArray[np.int16]]) -> None:
-        self._total, self._messages = total, messages
+    def _begin(self, total: NDArray[np.int16], observed: NDArray[np.int16], messages: list[NDArray[np.int16]]) -> None:
+        self._total, self._observed, self._messages = total, observed, messages
         # Allocating arrays of this size costs more than the computation.
         degree = max(len(row) for row in self._rows)
         self._incoming = np.empty((degree, self._code.z, total.shape[1]), np.int16)
@@ -197,20 +200,18 @@ class _Layers:
 
     def keep(self, blocks: NDArray[np.bool_]) -> None:
         """Continue with some blocks of the batch."""
-        total = np.ascontiguousarray(self._total[:, blocks])
-        self._begin(total, [np.ascontiguousarray(message[:, :, blocks]) for message in self._messages])
+        total, observed = (np.ascontiguousarray(values[:, blocks]) for values in (self._total, self._observed))
+        self._begin(total, observed, [np.ascontiguousarray(message[:, :, blocks]) for message in self._messages])
 
     def information(self) -> Bits:
         """(batch, k) hard decisions."""
         return np.asarray((self._total[: self._code.k] < 0).T, np.uint8)
 
-    def unsatisfied(self) -> NDArray[np.float64]:
-        """(batch,) share of checks that the hard decisions violate."""
-        count = np.zeros(self._total.shape[1])
-        for row in self._rows:
-            parity = np.bitwise_xor.reduce(self._gather(row), axis=0) < 0
-            count += np.count_nonzero(parity, axis=0)
-        return count / (len(self._rows) * self._code.z)
+    def agreement(self) -> NDArray[np.float64]:
+        """(batch,) agreement of the observed bits with what their checks infer, standard deviations of chance."""
+        pull = np.clip(self._total - self._observed, -_MAX_PULL, _MAX_PULL).astype(np.float32)
+        pull *= np.sign(self._observed) * (self._observed < _KNOWN)
+        return np.asarray(pull.sum(axis=0) / (np.linalg.norm(pull, axis=0) + 1e-6), np.float64)
 
     def _gather(self, places: NDArray[np.intp]) -> NDArray[np.int16]:
         return self._total.take(places, axis=0, out=self._incoming[: len(places)], mode="clip")

@@ -123,6 +123,8 @@ def _receive_either_way(cache: FrameCache, options: ReceiverOptions) -> Received
         if not _gives_few(result):
             rank = not _is_reversed(result), attempt.n_believable, quarter_turns
             attempts.append((rank, attempt._replace(result=result)))
+        elif known_camera(frame, options) is None:
+            break  # An estimated camera is read in either direction.
     if attempts:
         (*_, quarter_turns), best = max(attempts, key=lambda attempt: attempt[0])
         return best.with_remark(Remark("turned_counterclockwise" if quarter_turns == 1 else "turned_clockwise"))

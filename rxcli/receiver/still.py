@@ -166,7 +166,10 @@ def slots_of_any_kind(acquisition: Acquisition, clocks: Sequence[Clock]) -> list
 
 
 def _joint_initial_pass(acquisition: Acquisition) -> Reception:
-    """Make a pass that detects slots and picture jointly: first every copy by itself, then the copies of bursts."""
+    """Make a pass that detects slots and picture jointly: first every copy by itself, then the copies of bursts.
+
+    Where whole copies by themselves show no packets, they are all that is detected.
+    """
     clock = acquisition.clock
     samples = sync.sample_slots(acquisition.profiles, clock, STILL.coarse_samples)
     model = _light_model(acquisition, clock, samples)
@@ -175,32 +178,33 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     model = replace(model, black_level=black_level)
     columns = np.arange(len(samples.light))
     by_start = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
-
-    def of_bursts(clock: Clock, lit: Float32Array | None) -> BurstSamples:
-        return ratios.burst_samples(by_start, clock, model, columns, lit)
-
-    single = clock.by_copy
-    alone = survivors.detect(of_bursts(single, None), QUICK_SURVIVORS)
-    lit = single.on_grid(alone.lit)
-    llr = channel.llr_of(lit)
-    some = _some(columns)
-
-    def of_way(clock: Clock) -> BurstSamples:
-        return _of_weights(ratios.burst_samples(by_start, clock, model, some, lit), alone.w_log_prob[some])
-
-    clock, _ = _ways_by_evidence(acquisition, clock, llr, of_way)[0]
-    bursts = _with_weights(of_bursts(clock, lit), alone.w_log_prob)
-    posteriors, free = survivors.detect_against_free(bursts, QUICK_SURVIVORS)
     contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
     snr = _joint_snr(model.over_black(samples), samples, model, clock)
-    # Noise is no evidence, and leaves most symbols open.
-    observed = assemble.slots_observed(samples, clock)[..., PREAMBLE_SLOTS:] > 0
-    is_shown = observed.reshape(*posteriors.log_prob.shape, -1).all(axis=-1)
-    is_decided = (posteriors.log_prob > np.log(0.5)) & is_shown
-    share = is_decided.sum(axis=(0, 2)) / np.maximum(is_shown.sum(axis=(0, 2)), 1) * ~dark_columns(snr)
-    posteriors = replace(posteriors, log_evidence=(posteriors.log_evidence - free) * share)
-    joint = np.ones(len(columns), bool)
-    return Reception(clock, samples, contrast, posteriors, snr, model, llr, joint, is_long=True)
+
+    def received(clock: Clock, bursts: BurstSamples, llr: Float32Array | None = None) -> Reception:
+        posteriors, free = survivors.detect_against_free(bursts, QUICK_SURVIVORS)
+        # Noise is no evidence, and leaves most symbols open.
+        observed = assemble.slots_observed(samples, clock)[..., PREAMBLE_SLOTS:] > 0
+        is_shown = observed.reshape(*posteriors.log_prob.shape, -1).all(axis=-1)
+        is_decided = (posteriors.log_prob > np.log(0.5)) & is_shown
+        share = is_decided.sum(axis=(0, 2)) / np.maximum(is_shown.sum(axis=(0, 2)), 1) * ~dark_columns(snr)
+        posteriors = replace(posteriors, log_evidence=(posteriors.log_evidence - free) * share)
+        llr = channel.llr_of(clock.on_grid(posteriors.lit)) if llr is None else llr
+        joint = np.ones(len(columns), bool)
+        return Reception(clock, samples, contrast, posteriors, snr, model, llr, joint, is_long=True)
+
+    alone = received(clock.by_copy, ratios.burst_samples(by_start, clock.by_copy, model, columns))
+    if alone.n_observed.all(axis=-1).any() and packet_llr(alone) < SETTINGS.min_packets_llr:
+        return alone
+    lit, w_log_prob, some = alone.clock.on_grid(alone.posteriors.lit), alone.posteriors.w_log_prob, _some(columns)
+
+    def of_way(clock: Clock) -> BurstSamples:
+        return _of_weights(ratios.burst_samples(by_start, clock, model, some, lit), w_log_prob[some])
+
+    clock, _ = _ways_by_evidence(acquisition, clock, alone.llr, of_way)[0]
+    return received(
+        clock, _with_weights(ratios.burst_samples(by_start, clock, model, columns, lit), w_log_prob), alone.llr
+    )
 
 
 def detect_jointly(
@@ -314,12 +318,14 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
 
     The start of packets was found by the ends of exposures, which stay where they are.
     """
-    every, some = np.arange(len(reception.snr)), _some(columns)
+    some = _some(columns)
     weights = reception.posteriors.w_log_prob[some]
     lit = reception.clock.on_grid(reception.posteriors.lit)
+    exposed = [_exposed_for(reception.clock, factor) for factor in STILL.exposure_factors]
+    views = [_view(acquisition, reception, some, STILL.coarse_samples, ratios.by_start(clock)) for clock in exposed]
 
-    def bursts(clock: Clock, level: float) -> BurstSamples:
-        samples, model = _view(acquisition, reception, every, STILL.coarse_samples, ratios.by_start(clock))
+    def bursts(clock: Clock, number: int, level: float) -> BurstSamples:
+        samples, model = views[number]
         model = replace(model, black_level=level)
         return _of_weights(ratios.burst_samples(samples, clock, model, some, lit), weights)
 
@@ -327,12 +333,12 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
         return int(survivors.log_evidence_of(parts, GLANCE).sum(axis=1).argmax())
 
     level = reception.model.black_level
-    exposed = [_exposed_for(reception.clock, factor) for factor in STILL.exposure_factors]
-    clock = exposed[likeliest([bursts(clock, level) for clock in exposed])]
+    number = likeliest([bursts(clock, number, level) for number, clock in enumerate(exposed)])
+    clock = exposed[number]
     light = reception.samples.light[reception.samples.valid > 0]
     levels = [float(np.percentile(light, STILL.dark_percent)) * share for share in STILL.dark_shares]
-    level = levels[likeliest([bursts(clock, level) for level in levels])]
-    ways = _ways_by_evidence(acquisition, clock, reception.llr, lambda way: bursts(way, level))
+    level = levels[likeliest([bursts(clock, number, level) for level in levels])]
+    ways = _ways_by_evidence(acquisition, clock, reception.llr, lambda way: bursts(way, number, level))
     (best, _), by_evidence = ways[0], [(way.burst, gain) for way, gain in ways]
     refined = replace(
         reception, clock=best, model=replace(reception.model, black_level=level), bursts_by_evidence=by_evidence

@@ -8,7 +8,7 @@ from rxcli.receiver.camera.advice import why_not
 from rxcli.receiver.camera.camera import camera_profile, in_time_order, lens_of, summary
 from rxcli.receiver.camera.curvature import curvature_terms
 from rxcli.receiver.camera.fit import settle
-from rxcli.receiver.camera.proposals import CameraHypothesis, propose, propose_slots
+from rxcli.receiver.camera.proposals import CameraHypothesis, in_phase, propose, propose_slots
 from rxcli.receiver.camera.strips import ColumnStrips, strips_of
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "ColumnStrips",
     "camera_profile",
     "curvature_terms",
+    "in_phase",
     "in_time_order",
     "lens_of",
     "propose",

@@ -56,7 +56,7 @@ class CameraHypothesis:
 def propose(
     strips: ColumnStrips, screens: Sequence[ScreenProfile], exposure_s: float | None = None, *, may_bend: bool = True
 ) -> list[CameraHypothesis]:
-    """Cameras that may have taken a picture, the best few.
+    """Cameras that may have taken a picture, the best few; `in_phase` makes one precise.
 
     Args:
         strips: of the picture as it is stored.
@@ -79,11 +79,10 @@ def propose(
     ranked = sorted(smeared + short, key=lambda clock: -clock.score)
     least = {False: SETTINGS.min_score, True: SETTINGS.min_long_score}
     likely = [clock for clock in ranked if clock.score >= least[clock.exposure_slots > LONG_EXPOSURE_SLOTS]]
-    found = [_in_phase(strips, clock, may_bend=may_bend) for clock in likely or short[:1]]
-    return [replace(clock, number=number) for number, clock in enumerate(found)]
+    return [replace(clock, number=number) for number, clock in enumerate(likely or short[:1])]
 
 
-def _in_phase(strips: ColumnStrips, clock: CameraHypothesis, *, may_bend: bool) -> CameraHypothesis:
+def in_phase(strips: ColumnStrips, clock: CameraHypothesis, *, may_bend: bool) -> CameraHypothesis:
     """A clock of a short exposure with rows per slot and bend by the whole picture, where that is plain."""
     rows = clock.rows_per_slot / strips.pitch
     # Beside the line of the mosaic, its phase cannot be distinguished from that of the slots.

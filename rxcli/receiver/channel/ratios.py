@@ -25,7 +25,7 @@ def burst_samples(
     """Samples of the bursts of some columns.
 
     Args:
-        samples: of all columns, see `by_start`.
+        samples: see `by_start`; of all columns, or of `columns` alone where `lit` is given.
         clock: the clock, its copies assigned to bursts.
         model: of the samples.
         columns: numbers of the columns to detect.
@@ -42,14 +42,16 @@ def burst_samples(
     else:
         own = light_through(exposed_from(clock.exposure_slots, q), lit)
     neighbours = model.crosstalk.from_neighbours(own, columns, clock.delay_slots * q)
-    light, mean, valid = light[columns], mean[columns], samples.valid[columns]
-    variance = model.noise.variance(above[columns]) / np.square(mean)
+    if len(light) > columns.size:
+        light, mean, above = light[columns], mean[columns], above[columns]
+        samples = samples.of_columns(columns)
+    variance = model.noise.variance(above) / np.square(mean)
     variance += np.square(light) * np.float32(SETTINGS.relative_error**2)
 
     def lanes(values: NDArray[np.floating[Any]]) -> Float32Array:
         return _by_lane(values, clock, q)
 
-    visible = lanes(valid)
+    visible = lanes(samples.valid)
     scale = -(lanes(np.log(mean)) * visible).sum(axis=(0, 1, 3), dtype=np.float64) / q
     return BurstSamples(
         light=lanes(light),

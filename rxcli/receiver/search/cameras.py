@@ -10,6 +10,7 @@ from rxcli.profiles import ScreenProfile, match_camera
 from rxcli.receiver.camera import (
     CameraHypothesis,
     ColumnStrips,
+    in_phase,
     lens_of,
     propose,
     propose_slots,
@@ -77,12 +78,17 @@ def propose_cameras(
         strips = _strips(context, profiles)
     # A picture does not show the slot rate: the fastest screen represents all with the same packet length.
     screens = sorted(options.screens, key=lambda screen: -screen.slot_rate_hz)
+    may_bend = may_bend and frame.mosaic is None
     with timer("blind"):
-        hypotheses = propose(strips, screens, frame.metadata.exposure_s, may_bend=may_bend and frame.mosaic is None)
+        hypotheses = propose(strips, screens, frame.metadata.exposure_s, may_bend=may_bend)
     rates = {screen.packet_slots: screen.slot_rate_hz for screen in reversed(screens)}
     ranked = sorted(hypotheses, key=lambda hypothesis: hypothesis.number)
     cameras = [estimated_camera(hypothesis, rates[hypothesis.packet_slots], frame) for hypothesis in ranked]
-    yield from [camera for camera in cameras if has_stated_readout(camera, frame)] or cameras
+    stated = [number for number, camera in enumerate(cameras) if has_stated_readout(camera, frame)]
+    for hypothesis in [ranked[number] for number in stated] or ranked:
+        with timer("blind"):
+            hypothesis = in_phase(strips, hypothesis, may_bend=may_bend)
+        yield estimated_camera(hypothesis, rates[hypothesis.packet_slots], frame)
     return why_not(strips)
 
 

@@ -144,7 +144,8 @@ def _at_likeliest_phase(context: FrameContext) -> Iterator[_Slots]:
     exposure_slots = camera.exposure_s * screen.slot_rate_hz
     top, bottom = sync.row_span(profiles)
     n_slots = int(np.ceil((bottom - top) / rows_per_slot)) + 1
-    is_cut = n_slots < 2 * max(possible.packet_slots for possible in context.screens)  # else a whole packet is in view
+    # Else a whole header is in view, which the search would have found.
+    is_cut = n_slots < max(possible.packet_slots for possible in context.screens) + PREAMBLE_SLOTS
     if not is_cut or n_slots <= SETTINGS.cut_symbols * SLOTS_PER_SYMBOL or exposure_slots > LONG_EXPOSURE_SLOTS:
         return
     clock = Clock(

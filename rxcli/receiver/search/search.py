@@ -270,31 +270,30 @@ class _Walk:
                 self._push(self._fresh, hypothesis.log_prior, hypothesis)
 
     def _score(self, hypothesis: Hypothesis) -> None:
-        """Make an initial pass; after a better hypothesis, and of a long exposure, of the bright columns first.
+        """Make an initial pass; after a better hypothesis, of the bright columns first.
 
         The others follow if the bright ones come near the best score; if that is beyond doubt, if they beat its own.
         """
         best, acquisition = self._best(), _acquired(hypothesis)
-        bright, is_long = acquisition.of_columns(acquisition.bright_columns), _is_long(acquisition)
-        # A known camera keeps its first hypothesis without packets as well: it shows what the light is.
-        if best is not None or (is_long and hypothesis.camera.hypothesis is not None):
-            if self._is_spent(_work_of(bright)):
-                self._tried.append(Tried(hypothesis, 0.0, hypothesis.log_prior, "not tried"))
-                return
+        bright = acquisition.of_columns(acquisition.bright_columns)
+        if self._is_spent(_work_of(bright if best else acquisition)):
+            self._tried.append(Tried(hypothesis, 0.0, hypothesis.log_prior, "not tried"))
+            return
+        if best is not None:
             half = self._measured(hypothesis, bright)
-            min_evidence = SETTINGS.few_packets if is_long else PASSES.min_packets_llr
-            min_score, lead = -np.inf, 0.0
-            if best is not None:
-                lead = evidence.bright_score(best) - best.score if best.evidence > PASSES.min_packets_llr else 0.0
-                is_plain = best.evidence > SETTINGS.plain
-                min_score = best.score + (lead if is_plain else -SETTINGS.reach)
-                min_evidence = min(min_evidence, best.evidence)
+            lead = evidence.bright_score(best) - best.score if best.evidence > PASSES.min_packets_llr else 0.0
+            min_score = best.score + (lead if best.evidence > SETTINGS.plain else -SETTINGS.reach)
+            min_evidence = min(SETTINGS.few_packets if _is_long(acquisition) else PASSES.min_packets_llr, best.evidence)
             is_likely = half.score >= min_score and half.evidence >= min_evidence
             if not is_likely or self._is_spent(_work_of(acquisition), half.evidence):
                 # By the bright columns alone scores are others than by all: the best one shows by how much.
                 self._tried.append(Tried(hypothesis, half.evidence, half.score - lead, "half"))
                 return
         scored = self._measured(hypothesis, acquisition)
+        # A known camera keeps its first hypothesis without packets as well: it shows what the light is.
+        if _is_long(acquisition) and hypothesis.camera.hypothesis and scored.evidence < SETTINGS.few_packets:
+            self._tried.append(Tried(hypothesis, scored.evidence, scored.score, "lost"))
+            return
         if scored.evidence > PASSES.min_packets_llr:
             # Packets may become certain once an estimated camera is fitted: then no other camera is tried.
             scored = self._fitted(scored)
