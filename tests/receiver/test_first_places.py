@@ -6,7 +6,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from rxcli.receiver.clip.acquiring import Place, agreeing
+from rxcli.receiver.clip.window import Place, agreeing
 from rxcli.receiver.clip.camera import Located
 from rxcli.receiver.clip.ends import dark_ends
 from rxcli.types import Frame

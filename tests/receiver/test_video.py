@@ -19,6 +19,7 @@ from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.receiver.channel.known_picture import ColumnLight, KnownPicture, Observation
 from rxcli.receiver.clip.settings import SETTINGS
+from rxcli.receiver.clip.window import Source
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Received
 from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
@@ -198,11 +199,11 @@ def test_products_take_one_thread_while_a_frame_is_received(clip: Clip, monkeypa
     def threads() -> list[int]:
         return [library["num_threads"] for library in blas.info() if _is_numpys(library)]
 
-    def add(_receiver: object, frame: Frame) -> list[FrameResult]:
+    def receive_next(_receiver: object, source: Source) -> list[FrameResult]:
         inside.append(threads())
-        return [FrameResult(frame.source, 0, 0.0, "no_screen")]
+        return [FrameResult(source.take().source, 0, 0.0, "no_screen")]
 
-    monkeypatch.setattr("rxcli.receiver.clip.receiver.ClipReceiver.add", add)
+    monkeypatch.setattr("rxcli.receiver.clip.receiver.ClipReceiver.receive_next", receive_next)
     with blas.limit(limits=2, user_api="blas"):
         if max(threads(), default=0) < 2:
             pytest.skip("this numpy's BLAS has one thread")

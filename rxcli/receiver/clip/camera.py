@@ -35,6 +35,8 @@ class Located:
     framing: Framing | None = None
     #: Rows at the top and at the bottom of the outline that may not be on the screen; None where that is not known.
     dark_ends: tuple[int, int] | None = None
+    #: The clock that frames after it show, where it does not by itself.
+    start: Start | None = None
 
     @property
     def camera_error(self) -> float:
@@ -46,7 +48,9 @@ class Located:
 
     @property
     def evidence(self) -> float:
-        """Of packets."""
+        """Of packets in it, or in the frame that shows the clock."""
+        if self.start is not None:
+            return self.start.log_evidence
         return self.found.best.evidence if isinstance(self.found, Found) else 0.0
 
     @property
@@ -97,7 +101,7 @@ class Located:
             return self
         own = self.context
         context = replace(located.context, cache=own.cache, sampled_corners=own.sampled_corners)
-        return Located(self.outline, context, None, located.framing, self.dark_ends)
+        return replace(self, context=context, found=None, framing=located.framing)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.clip.bursts import Burst, bursts_of, doubts, lit_slots
 from rxcli.receiver.clip.common_clock import Start
-from rxcli.receiver.clip.reporting import Reporter
+from rxcli.receiver.clip.reporting import completed
 from rxcli.receiver.clip.scene import TrackedScreen
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.timeline import Timeline
@@ -29,7 +29,7 @@ class Ledger:
     """
 
     def __init__(self, options: ReceiverOptions, on_taps: OnTaps | None) -> None:
-        self._options, self._reporter = options, Reporter(options, on_taps)
+        self._options, self._on_taps = options, on_taps
         #: Frames without a result, oldest first; all that were received belong to the link's present time.
         self._waiting: deque[Waiting] = deque()
         #: Bursts that are still going on, by number.
@@ -66,7 +66,7 @@ class Ledger:
         """Whether all bursts that a frame should show are certain in all lit columns."""
         if self._timeline is None or scene.last is None or self._n_held:
             return False
-        numbers = self._timeline.predicted(frame, scene.rows, scene.last.acquisition.clock.rows_per_slot)
+        numbers = self._timeline.predicted(frame, scene.pose.rows, scene.last.acquisition.clock.rows_per_slot)
         lit = np.median(scene.last.snr, axis=1) >= 1
         bursts = [self._bursts[number] for number in numbers if number in self._bursts]
         return len(bursts) == len(numbers) > 0 and bool(lit.any()) and all(burst.certain[lit].all() for burst in bursts)
@@ -216,4 +216,4 @@ class Ledger:
         for burst in closed:
             del self._bursts[burst.number]
         going_on = [burst for burst in own if burst.number in shown]
-        return self._reporter.completed(waiting, self._timeline, closed, going_on, self.certainty)
+        return completed(waiting, self._timeline, closed, going_on, self.certainty, self._options, self._on_taps)

@@ -16,12 +16,12 @@ import numpy as np
 from rxcli.numerics import one_blas_thread
 from rxcli.options import ReceiverOptions
 from rxcli.receiver.channel import lit_of
-from rxcli.receiver.clip.acquiring import Window
 from rxcli.receiver.clip.camera import Acquired, ClipCamera, Located
 from rxcli.receiver.clip.ledger import Ledger
 from rxcli.receiver.clip.scene import TrackedScreen, by_copy_llr
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import JointSlots, View, Waiting, decides_jointly
+from rxcli.receiver.clip.window import Source, first_place
 from rxcli.receiver.decode import assemble
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.passes import Reception, shows_steady_light
@@ -35,16 +35,14 @@ def receive_clip(
     frames: Iterable[Frame], options: ReceiverOptions, on_taps: OnTaps | None = None
 ) -> Iterator[FrameResult]:
     """Receive the frames of a clip; results come a frame or more late. An error of `frames` comes after all results."""
-    receiver = ClipReceiver(options, on_taps)
-    try:
-        for frame in frames:
-            with one_blas_thread():
-                results = receiver.add(frame)
-            yield from results
-    except Exception:
-        yield from receiver.finish()
-        raise
+    source, receiver = Source(frames), ClipReceiver(options, on_taps)
+    while source.ahead(1):
+        with one_blas_thread():
+            results = receiver.receive_next(source)
+        yield from results
     yield from receiver.finish()
+    if source.error is not None:
+        raise source.error
 
 
 class ClipReceiver:
@@ -54,9 +52,8 @@ class ClipReceiver:
         #: Link time, bursts and results that wait.
         self._ledger = Ledger(options, on_taps)
         self._camera = ClipCamera(options)
-        #: Whether the clip is in its window, the frames of it, and whether frames that show nothing may wait.
-        self._is_acquiring, self._may_wait = "tracking" in options.skip, True
-        self._window: Window | None = None
+        #: Whether first frames are still looked at together, and how many of the next showed nothing so.
+        self._is_acquiring, self._n_alone = "tracking" in options.skip, 0
         #: The screen that is followed; None where no picture is known.
         self._scene: TrackedScreen | None = None
         #: The last frame; (4, 2) of the screen in the last one that showed it; and where it was found last.
@@ -66,55 +63,23 @@ class ClipReceiver:
         #: Log-odds that the picture moves on the screen, and whether it was another one before.
         self._film_log_odds, self._has_changed = SETTINGS.film_log_odds, False
 
-    def add(self, frame: Frame) -> list[FrameResult]:
+    def receive_next(self, source: Source) -> list[FrameResult]:
         """Receive the next frame; returns the results that are complete."""
-        results: list[FrameResult] = []
-        if self._window is not None and not self._window.is_like(frame):
-            results = self._close_window()
-            self._is_acquiring, self._camera, self._scene = True, self._camera.of_frame(frame), None
-        if not self._is_acquiring:
-            return self._receive(frame)
-        if self._window is None:
-            self._window = Window.begin(frame, self._camera, may_wait=self._may_wait)
-        else:
-            self._window = self._window.with_frame(frame, self._camera)
-        return results + self._receive_window()
+        located: Located | Failure | None = None
+        if self._is_acquiring:
+            located, n_seen = first_place(source, self._camera, may_wait=self._n_alone == 0)
+            if isinstance(located, Located):
+                self._is_acquiring, self._ledger.start = False, located.start
+            self._n_alone = max(self._n_alone, n_seen) - 1
+        return self._receive(source.take(), located)
 
     def finish(self) -> list[FrameResult]:
         """The results still held back."""
-        return self._close_window() + self._ledger.finish()
-
-    # -- the first frames ----------------------------------------------------------------------------------------------
-
-    def _close_window(self) -> list[FrameResult]:
-        """Receive the frames that wait for more, since none come."""
-        results: list[FrameResult] = []
-        while self._window is not None:
-            results += self._receive_window(are_all=True)
-        return results
-
-    def _receive_window(self, *, are_all: bool = False) -> list[FrameResult]:
-        """Receive the window's frames if they are enough; one by one if they show no screen and camera."""
-        assert self._window is not None
-        window = self._window = self._window.searched(self._camera, are_all=are_all)
-        if not (window.is_complete or are_all):
-            return []
-        self._window = None
-        is_found = isinstance(window.located, Located)
-        if is_found:
-            window = window.with_clock(self._camera.options.screens)
-            self._ledger.start = window.start or self._ledger.start
-            self._is_acquiring = False
-        results = self._receive(window.frames[0], window.located)
-        may_wait, self._may_wait = self._may_wait, is_found
-        for frame in window.frames[1:]:
-            results += self.add(frame)
-        self._may_wait = may_wait
-        return results
+        return self._ledger.finish()
 
     # -- one frame -----------------------------------------------------------------------------------------------------
 
-    def _receive(self, frame: Frame, located: Located | Failure | None = None) -> list[FrameResult]:
+    def _receive(self, frame: Frame, located: Located | Failure | None) -> list[FrameResult]:
         """Receive a frame by what is known, or like a photograph where it does not fit; `located` where it is."""
         cache, ledger = FrameCache(frame), self._ledger
         remarks = (Remark("nominal_times"),) if frame.nominal_time else ledger.remarks
@@ -175,7 +140,13 @@ class ClipReceiver:
         if isinstance(acquired, Failure):
             return acquired
         options, acquisition, timer = self._camera.options, acquired.acquisition, cache.timer
-        tracks, adds_up, denoised = _can_track(acquired, options), self._adds_up(acquired.initial), frozenset[int]()
+        tracks, is_joint, denoised = (
+            _can_track(acquired, options),
+            decides_jointly(acquired.initial.clock),
+            frozenset[int](),
+        )
+        # Slots of copies that were detected jointly, or of a picture that changes, do not add up.
+        adds_up = not (is_joint or self._has_changed)
         with timer("detect"):
             reception = decode(acquisition, options.skip, acquired.initial, adds_up=adds_up)
         # Else further frames show the picture.
@@ -189,42 +160,29 @@ class ClipReceiver:
         if assemble.all_dark(reception.snr):
             return Failure(Remark("nothing_lit"))
         self._outline = located.outline
-        view = self._photographed(acquired, reception, denoised)
-        if tracks:
-            with timer("sampling"):
-                self._follow(view, located, reception)
-        return view
-
-    def _adds_up(self, initial: Reception) -> bool:
-        """Whether slots of a photograph's copies add up: neither detected jointly nor of a changing picture."""
-        return not decides_jointly(initial.clock) and not self._has_changed
-
-    def _photographed(self, acquired: Acquired, reception: Reception, denoised: frozenset[int]) -> View:
-        """What a frame that was received like a photograph shows."""
-        llr = reception.llr
-        if decides_jointly(acquired.initial.clock):
-            llr = by_copy_llr(lit_of(llr))
-        is_sum = self._adds_up(acquired.initial)
-        return View(
+        view = View(
             acquired.context,
-            acquired.acquisition,
+            acquisition,
             reception.clock,
-            llr,
+            by_copy_llr(lit_of(reception.llr)) if is_joint else reception.llr,
             np.minimum(assemble.slots_observed(reception.samples, reception.clock.by_copy), 1),
             reception.snr,
             denoised,
             framing=acquired.framing,
             changed=self._has_changed,
-            joint=None if is_sum else JointSlots(reception.clock.burst, reception.posteriors),
+            joint=None if adds_up else JointSlots(reception.clock.burst, reception.posteriors),
         )
+        if tracks:
+            with timer("sampling"):
+                self._follow(view, located, reception)
+        return view
 
     def _follow(self, view: View, located: Located, reception: Reception) -> None:
         """Follow the screen from a frame on, and learn its picture there."""
         scene = self._scene = TrackedScreen(
             replace(view.context, sampled_corners=located.context.sampled_corners),
             view.acquisition,
-            reception.model,
-            reception.posteriors.w_log_prob,
+            reception,
             self._film_log_odds,
             self._has_changed,
             self._camera.options.corners is not None,

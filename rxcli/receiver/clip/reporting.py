@@ -1,7 +1,7 @@
 """The result of a frame of a clip: the packets of the bursts that it shows last."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,52 +16,52 @@ from rxcli.receiver.decode.soft_bits import clip_soft_bits
 from rxcli.types import BELIEVABLE, FrameResult, IntArray, OnTaps
 
 
-@dataclass(frozen=True, slots=True)
-class Reporter:
-    """Writes the results of frames."""
+def completed(
+    waiting: Waiting,
+    timeline: Timeline,
+    closed: Sequence[Burst],
+    going_on: Sequence[Burst],
+    certainty: float,
+    options: ReceiverOptions,
+    on_taps: OnTaps | None,
+) -> FrameResult:
+    """The result of a received frame.
 
-    options: ReceiverOptions
-    #: Is given the arrays of every received frame.
-    on_taps: OnTaps | None
-
-    def completed(
-        self, waiting: Waiting, timeline: Timeline, closed: Sequence[Burst], going_on: Sequence[Burst], certainty: float
-    ) -> FrameResult:
-        """The result of a received frame.
-
-        Args:
-            waiting: the frame.
-            timeline: that numbered its bursts.
-            closed: its bursts that no later frame shows.
-            going_on: its other bursts.
-            certainty: probability that the screen's columns are numbered right.
-        """
-        result, view = waiting.result, waiting.view
-        assert view is not None
-        ended = [burst.ended(view) for burst in closed]
-        framing = np.ones(view.clock.n_copies)
-        for burst, end in zip(closed, ended, strict=True):
-            framing[end.index] = timeline.certainty(burst.copies)
-        headerless = timeline.headerless(ended, len(view.snr))
-        columns = assemble.clip_results(
-            assemble.FrameColumns(view.clock, view.snr, headerless, self.options.min_confidence, certainty, framing),
-            ended,
-            lambda column: any(burst.probability(column) >= BELIEVABLE for burst in going_on),
-        )
-        if view.denoised:
-            columns = tuple(replace(column, denoised=column.column in view.denoised) for column in columns)
-        if view.context.camera.reversed:
-            columns = tuple(assemble.in_stored_rows(column, view.context.frame.height) for column in columns)
-        if self.on_taps is not None:
-            self.on_taps(result.source, result.frame, _taps(result, view, ended))
-        soft = None
-        if self.options.soft_bits:
-            soft = clip_soft_bits(ended, assemble.snr_db_of_columns(view.snr), timeline.epoch)
-        if soft is not None:
-            soft = replace(soft, source=result.source, frame=result.frame, time_s=result.time_s)
-        name = view.acquisition.variant(timeline.phase.repeats).name
-        status = assemble.clip_status(columns)
-        return replace(result, columns=columns, status=status, screen_profile=name, soft_bits=soft)
+    Args:
+        waiting: the frame.
+        timeline: that numbered its bursts.
+        closed: its bursts that no later frame shows.
+        going_on: its other bursts.
+        certainty: probability that the screen's columns are numbered right.
+        options: of the receiver.
+        on_taps: is given the arrays of every received frame.
+    """
+    result, view = waiting.result, waiting.view
+    assert view is not None
+    ended = [burst.ended(view) for burst in closed]
+    framing = np.ones(view.clock.n_copies)
+    for burst, end in zip(closed, ended, strict=True):
+        framing[end.index] = timeline.certainty(burst.copies)
+    headerless = timeline.headerless(ended, len(view.snr))
+    columns = assemble.clip_results(
+        assemble.FrameColumns(view.clock, view.snr, headerless, options.min_confidence, certainty, framing),
+        ended,
+        lambda column: any(burst.probability(column) >= BELIEVABLE for burst in going_on),
+    )
+    if view.denoised:
+        columns = tuple(replace(column, denoised=column.column in view.denoised) for column in columns)
+    if view.context.camera.reversed:
+        columns = tuple(assemble.in_stored_rows(column, view.context.frame.height) for column in columns)
+    if on_taps is not None:
+        on_taps(result.source, result.frame, _taps(result, view, ended))
+    soft = None
+    if options.soft_bits:
+        soft = clip_soft_bits(ended, assemble.snr_db_of_columns(view.snr), timeline.epoch)
+    if soft is not None:
+        soft = replace(soft, source=result.source, frame=result.frame, time_s=result.time_s)
+    name = view.acquisition.variant(timeline.phase.repeats).name
+    status = assemble.clip_status(columns)
+    return replace(result, columns=columns, status=status, screen_profile=name, soft_bits=soft)
 
 
 def _taps(result: FrameResult, view: View, ended: Sequence[BurstInView]) -> dict[str, Any]:

@@ -5,38 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from rxcli.receiver.clip.follow import Pose
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.context import FrameContext
-from rxcli.receiver.light import Crosstalk
-from rxcli.receiver.plane import tracked
 from rxcli.receiver.search.framing import Framing
-from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, FrameResult, IntArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Pose:
-    """Where the light of a screen is read in a frame, and where its picture is."""
-
-    #: (4, 2) pixels each, the viewer's top-left first.
-    read: FloatArray
-    picture: FloatArray
-    map: tracked.StripMap
-    #: The strips on whose rows the picture is known.
-    home: tracked.StripMap
-    #: Of the strips where they are read.
-    crosstalk: Crosstalk
-    #: (C, R) row of the known picture at each row of the frame; None where the screen is where it was first.
-    picture_row: Float32Array | None = None
-    #: Columns by which the strips lie to the right of their places, and whole strips by which the picture has moved to
-    #: the right on the screen.
-    offset: float = 0.0
-    shift: int = 0
-
-    @property
-    def rows(self) -> FloatArray:
-        """(R,) sensor rows that are read."""
-        return self.map.rows
+from rxcli.types import BurstPosteriors, Clock, Float32Array, FrameResult, IntArray
 
 
 def decides_jointly(clock: Clock) -> bool:
