@@ -14,7 +14,7 @@ from rxcli.receiver.clip.place import ScreenPlace
 from rxcli.receiver.light import Crosstalk, NoiseModel, SlotLight
 from rxcli.receiver.screen import geometry
 from rxcli.results.truth import Score
-from rxcli.types import Float32Array, Frame, FrameResult
+from rxcli.types import Float32Array, FrameResult
 from tests.receiver.test_moving_clips import filmed_by, received, scene_in_hand, surely_wrong
 
 CORNERS = np.array([[100.0, 80.0], [1100.0, 90.0], [1090.0, 640.0], [110.0, 650.0]])
@@ -81,15 +81,6 @@ def test_a_film_received_promptly_gives_the_same_and_certain_frames_are_passed_o
 # -- where the screen is -----------------------------------------------------------------------------------------------
 
 
-def frame_of(corners: np.ndarray) -> Frame:
-    """A frame with light between corners (4, 2)."""
-    import cv2
-
-    pixels = np.zeros((720, 1200), np.uint8)
-    cv2.fillConvexPoly(pixels, corners.round().astype(np.int32), 200)
-    return Frame(pixels, "clip", 0, 0.0)
-
-
 def place(log_odds: float = -3.0) -> ScreenPlace:
     return ScreenPlace.at(CORNERS, N_COLUMNS, None, log_odds)
 
@@ -103,24 +94,13 @@ def test_columns_tell_a_moving_picture_from_a_moving_screen(is_film: bool) -> No
     here, picture = place(), CORNERS
     for number in range(1, 6):
         before, picture = picture, moved(CORNERS, 0.1 * number)
-        frame = frame_of(CORNERS if is_film else picture)
-        here = here.after(before, picture, frame)
+        here = here.after(before, picture)
         true = CORNERS if is_film else picture
         read = here.likelier.corners
         off = N_COLUMNS * geometry.sides_off(true, read, None)
         here = here.measured(read, off, 0.01**2 * np.eye(2))
         assert here.is_film == is_film
         assert np.abs(here.likelier.corners - true).max() < 5
-
-
-@pytest.mark.parametrize("is_film", [True, False])
-def test_light_at_the_ends_tells_so_up_and_down(is_film: bool) -> None:
-    here, picture = place(), CORNERS
-    for number in range(1, 6):
-        before, picture = picture, CORNERS - [0.0, 8.0 * number]
-        here = here.after(before, picture, frame_of(CORNERS if is_film else picture))
-        here = here.measured(here.likelier.corners, np.zeros(2), 0.01**2 * np.eye(2))
-    assert here.is_film == is_film
 
 
 def test_columns_are_found_beside_where_they_were_read() -> None:

@@ -6,9 +6,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from rxcli.receiver.clip.window import Place, agreeing
 from rxcli.receiver.clip.camera import Located
 from rxcli.receiver.clip.ends import dark_ends
+from rxcli.receiver.clip.window import Place, agreeing
 from rxcli.types import Frame
 
 CORNERS = np.array([[100.0, 50.0], [1700.0, 60.0], [1690.0, 950.0], [110.0, 940.0]])

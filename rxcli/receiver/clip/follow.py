@@ -93,7 +93,7 @@ class Follower:
             found = replace(found, corners=self.pose.picture)
             self._n_rested += 1
         else:
-            self.place = self.place.after(self.pose.picture, found.corners, frame)
+            self.place = self.place.after(self.pose.picture, found.corners)
             self.move(frame, found)
             self._n_rested = 0
         self._texture.learn(frame, found)

@@ -41,15 +41,8 @@ class Measured:
     #: (C, N) log-likelihood ratio of every slot, and (C, 1) squared contrast over variance of a slot.
     llr: Float32Array
     snr: Float32Array
-    #: (C, R) light of the columns by the decided slots; and (C,) information on the slots: its precision.
+    #: (C, R) light of the columns by the decided slots.
     expected: Float32Array
-    information: Float32Array
-
-    def with_columns(self, which: BoolArray, given: Measured) -> Measured:
-        """The same with some columns as `given`."""
-        pairs = ((self.llr, given.llr), (self.snr, given.snr), (self.expected, given.expected))
-        llr, snr, expected = (np.where(which[:, None], theirs, own) for own, theirs in pairs)
-        return replace(self, llr=llr, snr=snr, expected=expected)
 
 
 def measured_by(
@@ -90,7 +83,7 @@ def measured_by(
     if judged is None:
         return None
     found = known_picture.slot_likelihoods(judged, expected, clock, isi_memory)
-    return Measured(clock, found.llr, found.snr, expected.light, judged.precision.sum(axis=1))
+    return Measured(clock, found.llr, found.snr, expected.light)
 
 
 def shown_slots(inside: BoolArray, positions: FloatArray, clock: Clock) -> IntArray:

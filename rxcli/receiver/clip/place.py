@@ -3,7 +3,7 @@
 The texture of the picture gives a precise motion, but of the picture. On a screen at rest a film may move; in a hand
 the screen moves with its picture. The stripes decide: their columns belong to the screen. In every frame the decided
 slots give the distance of the columns from where they were read, at the left and at the right, so both hypotheses are
-followed and compared by their likelihood. Up and down, the light at the screen's ends decides.
+followed and compared by their likelihood.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.screen import geometry
-from rxcli.types import FloatArray, Frame, Lens
+from rxcli.types import FloatArray, Lens
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,15 +59,14 @@ class ScreenPlace:
         """(2,) columns by which the left and the right of `corners` (4, 2) lie to the right of the screen's sides."""
         return self.n_columns * geometry.sides_off(hypothesis.corners, corners, self.lens)
 
-    def after(self, before: FloatArray, after: FloatArray, frame: Frame) -> ScreenPlace:
+    def after(self, before: FloatArray, after: FloatArray) -> ScreenPlace:
         """The place predicted for a frame, whose picture moved from corners (4, 2) `before` to corners `after`."""
         last = self.likelier
         together = replace(last, corners=geometry.carried(last.corners, before, after, self.lens))
         # A camera in a hand moves the screen, too, by an unknown part of it: both sides by the same.
         unsure = SETTINGS.unsteady_share * self.off(together.corners, last).mean()
         resting = replace(last, covariance=last.covariance + unsure**2)
-        shown = _log_odds_of_ends(frame, together.corners, resting.corners)
-        return replace(self, together=together, resting=resting, log_odds=self.log_odds + shown)
+        return replace(self, together=together, resting=resting)
 
     def measured(self, read: FloatArray, off: FloatArray, covariance: FloatArray) -> ScreenPlace:
         """The place after the light of a frame was compared with its slots.
@@ -94,32 +93,3 @@ class ScreenPlace:
         corners = geometry.beside(hypothesis.corners, -(gain @ error) / self.n_columns, self.lens)
         log_likelihood = -(error @ np.linalg.solve(total, error) + np.linalg.slogdet(total)[1]) / 2
         return Hypothesis(corners, (np.eye(2) - gain) @ hypothesis.covariance), float(log_likelihood)
-
-
-def _log_odds_of_ends(frame: Frame, together: FloatArray, resting: FloatArray) -> float:
-    """Log-odds of the corners (4, 2) `resting` against `together` by the light where only one has the screen."""
-    log_odds, x = 0.0, np.linspace(0.1, 0.9, SETTINGS.n_end_places)
-    for left, right, inwards in ((0, 1, 1), (3, 2, -1)):
-        (here, there), places = (
-            [a[left, 1] + (a[right, 1] - a[left, 1]) * x for a in (together, resting)],
-            (together[left, 0] + (together[right, 0] - together[left, 0]) * x).round().astype(int),
-        )
-        height = round(float(np.abs(here - there).mean()))
-        if height < SETTINGS.min_end_rows:
-            continue
-        # Rows of one alone, and as many that both have.
-        outer, inner = (np.minimum(here, there), np.maximum(here, there))[::inwards]
-        of_one = _mean_light(frame, (outer + inner) / 2, places, height)
-        of_both = _mean_light(frame, inner + inwards * height / 2, places, height)
-        dark = SETTINGS.min_end_light * (frame.white - frame.black)
-        share = float(np.clip((of_one + dark) / (of_both + 2 * dark), 0, 1).mean())
-        is_resting = (there.mean() - here.mean()) * inwards < 0
-        log_odds += SETTINGS.end_log_odds * (2 * share - 1) * (1 if is_resting else -1)
-    return log_odds
-
-
-def _mean_light(frame: Frame, rows: FloatArray, columns: FloatArray, height: int) -> FloatArray:
-    """(n,) mean light over black of `height` rows around the pixels at `rows` and `columns` (n,)."""
-    y = np.clip(rows.round().astype(int) + np.arange(height)[:, None] - height // 2, 0, frame.height - 1)
-    values = frame.pixels[y, np.clip(columns, 0, frame.width - 1)].astype(np.float64)
-    return np.asarray(np.maximum(values - frame.black, 0).mean(axis=0))

@@ -25,7 +25,7 @@ from rxcli.receiver.light import MIN_VARIANCE, Exposure, NoiseModel, SlotLight
 from rxcli.receiver.plane import tracked
 from rxcli.receiver.still import detect_jointly, detected, in_bursts, lateness
 from rxcli.receiver.sync import tracking
-from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, Frame, IntArray
+from rxcli.types import Clock, Float32Array, FloatArray, Frame, IntArray
 
 
 class TrackedScreen:
@@ -195,48 +195,26 @@ class TrackedScreen:
         n_slots = int(np.ceil(clock.exposure_slots))
         expected = known_picture.expected_light(lit, positions, clock.exposure_slots, n_slots, fit).light
         rows_per_slot, share = clock.rows_per_slot, SETTINGS.frame_share
-        judged = picture.judge(observed.columns, expected, max_misfit, share, rows_per_slot)
-        if judged is None:
+        if picture.judge(observed.columns, expected, max_misfit, share, rows_per_slot) is None:
             return None, joint
-        return Measured(clock, llr, snr, expected, judged.precision.sum(axis=1)), joint
+        return Measured(clock, llr, snr, expected), joint
 
     def _measured(
         self, picture: PlacedPicture, observed: Observed, clock: Clock, lit: Float32Array | None, max_misfit: float
     ) -> Measured | None:
-        """Measure a frame; see `measured_by`.
-
-        Where the picture may have changed, each column counts by the known picture or by what the frame shows of it,
-        whichever has more information on the slots.
-        """
-        known = None
+        """Measure a frame by the known picture or, where pictures change, by what the frame shows of it."""
         if not (self._changes or observed.changed):
-            known = measured_by(picture, observed, clock, lit, max_misfit, self._isi_memory)
-            # A picture of few frames is not known well.
-            may_have_changed = lit is None and self._n_updates >= SETTINGS.first_frames
-            if known is None or not may_have_changed or (picture.excess < SETTINGS.changed_misfit).all():
-                return known
-        shown = observed.picture
-        if lit is None and shown is picture:  # Decided slots show more than the mean light of symbols.
-            shown = picture.adapted(observed.light, None, clock.rows_per_slot)
-        adapted = measured_by(shown, observed, clock, lit, max_misfit, self._isi_memory, adapts=True)
-        if adapted is None:
-            return known
-        found, changed = adapted, np.ones(len(adapted.llr), bool)
-        if known is not None:
-            changed = (picture.excess >= SETTINGS.changed_misfit) & (adapted.information > known.information)
-            found = known.with_columns(changed, adapted)
-            if changed.mean() > 0.5:
-                self._n_changed = SETTINGS.look_every
-        return replace(found, llr=self._with_doubtful(observed, found.clock, found.llr, changed))
+            return measured_by(picture, observed, clock, lit, max_misfit, self._isi_memory)
+        found = measured_by(observed.picture, observed, clock, lit, max_misfit, self._isi_memory, adapts=True)
+        return found and replace(found, llr=self._with_doubtful(observed, found.clock, found.llr))
 
-    def _with_doubtful(self, observed: Observed, clock: Clock, llr: Float32Array, changed: BoolArray) -> Float32Array:
-        """Slots, those of doubtful `changed` (C,) columns detected jointly without a picture as well.
+    def _with_doubtful(self, observed: Observed, clock: Clock, llr: Float32Array) -> Float32Array:
+        """Slots, those of doubtful columns detected jointly without a picture as well.
 
         The picture as the frame shows it and no picture at all err unlike, and share the noise: their mean counts.
         """
         found = detected(llr, clock)
-        doubts = found.log_prob.sum(axis=2).min(axis=0) < SETTINGS.doubtful_log_prob
-        doubtful = np.flatnonzero(doubts & changed)
+        doubtful = np.flatnonzero(found.log_prob.sum(axis=2).min(axis=0) < SETTINGS.doubtful_log_prob)
         if not doubtful.size:
             return llr
         strips = self._acquired(observed.light, observed.pose, None, clock)

@@ -23,12 +23,6 @@ class ClipSettings(msgspec.Struct, frozen=True):
     place_sd: float = 0.05
     columns_sd: float = 0.01
     unsteady_share: float = 0.3
-    #: Ends of the screen: places along them, least rows by which hypotheses differ, light in units of white that counts
-    #: as none, and log-odds by which light at an end decides.
-    n_end_places: int = 40
-    min_end_rows: int = 2
-    min_end_light: float = 0.02
-    end_log_odds: float = 2.0
     #: Movement that is none: pixels, or standard deviations of what was found.
     still_px: float = 0.3
     still_sds: float = 2.5
@@ -47,8 +41,6 @@ class ClipSettings(msgspec.Struct, frozen=True):
     #: that is taken to rest: while it does 0.8 to 1.3 times, 2 pixels away 2 times and more.
     misfit: float = 40.0
     rest_misfit: float = 1.5
-    #: The same from which a column's picture may have changed: in a hand it is 1.6 on average.
-    changed_misfit: float = 3.0
     #: Contrast of headers, against full, below which nothing is known any more, and contrast of a frame below which
     #: compression has taken much of it.
     min_header: float = 0.3
