@@ -201,7 +201,7 @@ def test_products_take_one_thread_while_a_frame_is_received(clip: Clip, monkeypa
 
     def receive_next(_receiver: object, source: Source) -> list[FrameResult]:
         inside.append(threads())
-        return [FrameResult(source.take().source, 0, 0.0, "no_screen")]
+        return [FrameResult(source.pop().source, 0, 0.0, "no_screen")]
 
     monkeypatch.setattr("rxcli.receiver.clip.receiver.ClipReceiver.receive_next", receive_next)
     with blas.limit(limits=2, user_api="blas"):

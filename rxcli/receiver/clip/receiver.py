@@ -71,7 +71,7 @@ class ClipReceiver:
             if isinstance(located, Located):
                 self._is_acquiring, self._ledger.start = False, located.start
             self._n_alone = max(self._n_alone, n_seen) - 1
-        return self._receive(source.take(), located)
+        return self._receive(source.pop(), located)
 
     def finish(self) -> list[FrameResult]:
         """The results still held back."""

@@ -28,7 +28,7 @@ from rxcli.types import FloatArray, Frame
 
 
 class Source:
-    """The frames of a clip, of which some are read ahead."""
+    """The frames of a clip, read ahead as far as somebody asks for."""
 
     def __init__(self, frames: Iterable[Frame]) -> None:
         self._frames, self._ahead = iter(frames), deque[Frame]()
@@ -43,7 +43,7 @@ class Source:
             self.error = error
         return list(takewhile(self._is_like_next, islice(self._ahead, n)))
 
-    def take(self) -> Frame:
+    def pop(self) -> Frame:
         """The next frame."""
         return self._ahead.popleft()
 
