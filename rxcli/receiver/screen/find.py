@@ -47,7 +47,7 @@ _ONE_SCREEN = 0.9
 #: Contrast, times what chance gives, from which packets are looked for; of a part of a picture it must be plainer.
 _POSSIBLE_CONTRAST = 0.5
 #: Log-odds relative to the likeliest first column down to which another one is possible.
-_MIN_LOG_ODDS = -7.0
+_MIN_LOG_ODDS = -12.0
 #: Number of unlit columns at a side from which the side counts as not visible.
 _UNLIT_COLUMNS = 0.5
 #: Share of the light on the smaller side of a gap without light, its width from which perspective may miss a column,

@@ -6,7 +6,7 @@ from rxcli.numerics import TINY
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.search.hypothesis import Scored
 from rxcli.receiver.search.settings import SETTINGS
-from rxcli.types import BELIEVABLE, BoolArray
+from rxcli.types import BELIEVABLE, BoolArray, Float32Array
 
 #: Columns of most screens. Evidence is scaled to them: narrower columns show the same light several times.
 USUAL_COLUMNS = 20
@@ -57,9 +57,13 @@ def bright_score(scored: Scored) -> float:
 
 def distinct_share(reception: Reception) -> float:
     """Share of the evidence that columns add to that of their left neighbours: too narrow ones repeat one packet."""
+    own = np.logaddexp(reception.posteriors.log_evidence, 0.0)
+    return 1 - max(float(own[1:] @ repeated_share(reception)) / (float(own.sum()) + TINY), 0.0)
+
+
+def repeated_share(reception: Reception) -> Float32Array:
+    """(C - 1,) correlation of the slots of neighbouring columns."""
     slots = reception.payload_lit
     slots = slots - slots.mean(axis=1, keepdims=True)
     slots /= np.linalg.norm(slots, axis=1, keepdims=True) + TINY
-    own = np.logaddexp(reception.posteriors.log_evidence, 0.0)
-    repeated = float(own[1:] @ (slots[1:] * slots[:-1]).sum(axis=1))
-    return 1 - max(repeated / (float(own.sum()) + TINY), 0.0)
+    return np.asarray((slots[1:] * slots[:-1]).sum(axis=1), np.float32)

@@ -8,46 +8,65 @@ from dataclasses import replace
 
 import numpy as np
 
-from rxcli.receiver.frame.acquisition import Acquisition
+from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.screen.geometry import homography
 from rxcli.receiver.screen.outline import Outline
+from rxcli.receiver.search import evidence
 from rxcli.receiver.search.hypothesis import Scored
 from rxcli.receiver.search.propose import Proposer
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.receiver.still import initial_pass
 
-#: Columns that are read beside the outermost, because they shed light there.
+#: Neighbours further in that show whether columns of the screen would have packets; they are read with them.
 _BESIDE = 2
+#: Limit of weighted evidence.
+_MAX_SHOWN = 30.0
 
 
-def less_likely_outlines(best: Scored, outlines: Sequence[Outline], proposer: Proposer) -> list[Outline]:
-    """The outlines, with lower log-odds where they leave out columns with packets.
+def rated_by_packets(best: Scored, outlines: Sequence[Outline], proposer: Proposer) -> list[Outline]:
+    """The outlines, with their log-odds by what those columns show that not all of them have.
 
-    On each side the nearest outline is read; those beyond it leave out further columns of the chosen one.
+    On each side the nearest outline is read, unless a packet shows that the columns exist which it leaves out.
 
     Args:
         best: the hypothesis that was chosen.
         outlines: all that were proposed.
         proposer: of the frame.
     """
-    own, n_columns = best.hypothesis.outline, best.hypothesis.screen.columns
+    own, n_columns, out = best.hypothesis.outline, best.hypothesis.screen.columns, list(outlines)
     acquisition = replace(best.acquisition, clock=best.reception.clock)
-    own_llr, out = np.maximum(best.reception.posteriors.log_evidence, 0.0), list(outlines)
     shifts = [_columns_between(own, rival, n_columns) if rival.family == own.family else 0 for rival in outlines]
     for side in (-1, 1):
         rivals = [index for index, shift in enumerate(shifts) if shift * side > 0]
         if not rivals:
             continue
         nearest = min(rivals, key=lambda index: abs(shifts[index]))
-        moved = replace(best.hypothesis, outline=outlines[nearest], camera=best.context.camera)
-        profiles, n = proposer.context(moved).sample_columns(n_columns), shifts[nearest]
-        gained = _outer_evidence(replace(acquisition, profiles=profiles), -n)
+        gained, n = 0.0, shifts[nearest]
+        if _existence(best.reception, n) < 0:
+            moved = replace(best.hypothesis, outline=outlines[nearest], camera=best.context.camera)
+            profiles = proposer.context(moved).sample_columns(n_columns)
+            read = slice(-n - _BESIDE - 1, None) if n > 0 else slice(0, -n + _BESIDE + 1)
+            columns = np.arange(n_columns)[read]
+            gained = _existence(initial_pass(replace(acquisition, profiles=profiles).of_columns(columns)), -n)
         for index in rivals:
-            shift = shifts[index]
-            lost = float((own_llr[:shift] if shift > 0 else own_llr[shift:]).sum())
-            log_odds = outlines[index].log_odds + SETTINGS.outer_weight * min(gained - lost, 0.0)
+            log_odds = outlines[index].log_odds + gained - _existence(best.reception, shifts[index])
             out[index] = replace(outlines[index], log_odds=log_odds)
     return out
+
+
+def _existence(reception: Reception, n: int) -> float:
+    """Log-likelihood ratio that the first `n` columns of a reception, or the last `-n`, are columns of the screen.
+
+    Beyond the screen there is no packet but that of a neighbour, whose light spreads. Within it there are packets, or
+    there are none because it is dark, by the rule of succession from the columns beside.
+    """
+    shown = SETTINGS.outer_weight * np.maximum(reception.posteriors.log_evidence, 0.0)
+    repeated = evidence.repeated_share(reception).clip(0, 1)
+    if n < 0:
+        n, shown, repeated = -n, shown[::-1], repeated[::-1]
+    shown = shown[:-1] * (1 - repeated)
+    with_packets = (np.count_nonzero(shown[n : n + _BESIDE] > 1) + 1) / (_BESIDE + 2)
+    return float(np.log1p(with_packets * (np.expm1(min(shown[:n].sum(), _MAX_SHOWN)) - 1)))
 
 
 def numbered(own: Outline, outlines: Sequence[Outline], score_of: Callable[[int], float | None]) -> Outline:
@@ -88,11 +107,3 @@ def _columns_between(own: Outline, rival: Outline, n_columns: int) -> int:
     """Columns by which an outline begins further to the viewer's right than one's own."""
     side = own.corners[1] - own.corners[0]
     return round(float((rival.corners[0] - own.corners[0]) @ side / (side @ side)) * n_columns)
-
-
-def _outer_evidence(acquisition: Acquisition, n: int) -> float:
-    """Log-likelihood ratio of packets in the first `n` columns, or in the last `-n`."""
-    read = slice(0, n + _BESIDE) if n > 0 else slice(n - _BESIDE, None)
-    reception = initial_pass(acquisition.of_columns(read))
-    outer = np.arange(n) if n > 0 else _BESIDE + np.arange(-n)
-    return float(np.maximum(reception.posteriors.log_evidence[outer], 0.0).sum())

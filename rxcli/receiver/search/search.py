@@ -23,7 +23,7 @@ from rxcli.receiver.screen.pose import corners_by_slots
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.cameras import settle
 from rxcli.receiver.search.hypothesis import Found, Hypothesis, Scored, Tried
-from rxcli.receiver.search.numbers import less_likely_outlines, numbered
+from rxcli.receiver.search.numbers import numbered, rated_by_packets
 from rxcli.receiver.search.outlines import proposed_screens
 from rxcli.receiver.search.propose import Proposer, ways
 from rxcli.receiver.search.refusal import light_without_data, why_no_packets
@@ -72,9 +72,12 @@ def search(
     if best is None:
         return replace(walk.why_no_packets(), tried=walk.record(None))
     proposer = walk.way_of(best.hypothesis)
-    outlines = list(proposer.outlines)
+    outlines, own = list(proposer.outlines), best.hypothesis.outline
     if best.evidence >= SETTINGS.few_packets:
-        outlines = less_likely_outlines(best, outlines, proposer)
+        outlines = rated_by_packets(best, outlines, proposer)
+        likeliest = max((rival for rival in outlines if rival.family == own.family), key=lambda rival: rival.log_odds)
+        if likeliest.log_odds > own.log_odds >= max(rival.log_odds for rival in proposer.outlines):
+            best = walk.renumbered(best, likeliest)
     chosen = numbered(best.hypothesis.outline, outlines, walk.score_of)
     refused = light_without_data(best.context, best.reception)
     if refused is not None and proposer.doubts:
@@ -177,6 +180,12 @@ class _Walk:
                 break
             best = fitted
         return best
+
+    def renumbered(self, best: Scored, outline: Outline) -> Scored:
+        """The same under another outline of its family."""
+        hypothesis = replace(best.hypothesis, outline=outline, camera=best.context.camera, clock=None)
+        found = self.way_of(hypothesis).with_clock(hypothesis)
+        return best if found is None else _in_likeliest_bursts(self._measured(found, _acquired(found)))
 
     def best_without_packets(self) -> Scored | None:
         """Hypothesis of the likeliest outline of a frame without packets, or None if the camera is not known."""

@@ -28,7 +28,7 @@ from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, cameras, outlines, search
 from rxcli.receiver.search.evidence import distinct_share
 from rxcli.receiver.search.hypothesis import Hypothesis
-from rxcli.receiver.search.numbers import less_likely_outlines
+from rxcli.receiver.search.numbers import rated_by_packets
 from rxcli.receiver.search.propose import Proposer, ways
 from rxcli.receiver.search.search import _Walk
 from rxcli.receiver.search.settings import SETTINGS
@@ -152,9 +152,22 @@ def test_columns_with_packets_are_not_left_out_of_the_screen() -> None:
     side = (own.corners[1] - own.corners[0]) / found.best.hypothesis.screen.columns
     rivals = [replace(own, corners=own.corners + shift * side, log_odds=-0.5) for shift in (-2, 1)]
     proposer = Proposer(cache, options, (own, *rivals), None)
-    kept, *less_likely = less_likely_outlines(found.best, (own, *rivals), proposer)
+    kept, *less_likely = rated_by_packets(found.best, (own, *rivals), proposer)
     assert kept is own
     assert max(one.log_odds for one in less_likely) < -3.0
+
+
+@pytest.mark.parametrize("shift", [-1, 1])
+def test_a_column_with_a_packet_beside_the_outline_corrects_its_number(shift: int) -> None:
+    trial = trial_of("paper-17k3")
+    side = (trial.corners[1] - trial.corners[0]) / 20
+    outlines = [Outline(trial.corners + shift * side), Outline(trial.corners, log_odds=-9.0)]
+    found = search(
+        FrameCache(trial.frame), ReceiverOptions(cameras=(trial.camera,), force_camera=True), outlines=outlines
+    )
+    assert isinstance(found, Found)
+    np.testing.assert_array_equal(found.best.hypothesis.outline.corners, trial.corners)
+    assert found.outline.certainty > 0.99
 
 
 def test_scores_by_the_bright_columns_compare_with_those_by_all() -> None:
