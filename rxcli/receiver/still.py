@@ -96,6 +96,8 @@ def decode(
         # Noise of rows is estimated from the slots: again once these are better.
         for _ in range(1 + (acquisition.profiles.has_row_noise and not initial.is_long)):
             reception = follow_picture(acquisition, reception, lit, keeps_weights=keeps_weights)
+            if not (lit := np.intersect1d(lit, doubtful_columns(reception))).size:
+                break
     return replace(reception, skipped={name: count for name, count in skipped.items() if count})
 
 
@@ -201,10 +203,10 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     def of_way(clock: Clock) -> BurstSamples:
         return _of_weights(ratios.burst_samples(by_start, clock, model, some, lit), w_log_prob[some])
 
-    clock, _ = _ways_by_evidence(acquisition, clock, alone.llr, of_way)[0]
-    return received(
-        clock, _with_weights(ratios.burst_samples(by_start, clock, model, columns, lit), w_log_prob), alone.llr
-    )
+    ways = _ways_by_evidence(acquisition, clock, alone.llr, of_way)
+    (clock, _), by_evidence = ways[0], [(way.burst, gain) for way, gain in ways]
+    bursts = _with_weights(ratios.burst_samples(by_start, clock, model, columns, lit), w_log_prob)
+    return replace(received(clock, bursts, alone.llr), bursts_by_evidence=by_evidence)
 
 
 def detect_jointly(
@@ -314,7 +316,7 @@ def _some(columns: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64]) -> Reception:
-    """The reception with exposure, black level and bursts of the largest evidence in some of `columns`.
+    """The reception with exposure and black level of the largest evidence in some of `columns`.
 
     The start of packets was found by the ends of exposures, which stay where they are.
     """
@@ -338,15 +340,7 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
     light = reception.samples.light[reception.samples.valid > 0]
     levels = [float(np.percentile(light, STILL.dark_percent)) * share for share in STILL.dark_shares]
     level = levels[likeliest([bursts(clock, number, level) for level in levels])]
-    ways = _ways_by_evidence(acquisition, clock, reception.llr, lambda way: bursts(way, number, level))
-    (best, _), by_evidence = ways[0], [(way.burst, gain) for way, gain in ways]
-    refined = replace(
-        reception, clock=best, model=replace(reception.model, black_level=level), bursts_by_evidence=by_evidence
-    )
-    if np.array_equal(best.burst, reception.clock.burst):
-        return refined
-    posteriors = replace(detected(reception.llr, best), log_evidence=reception.posteriors.log_evidence)
-    return replace(refined, posteriors=posteriors)
+    return replace(reception, clock=clock, model=replace(reception.model, black_level=level))
 
 
 def _ways_by_evidence(

@@ -368,6 +368,7 @@ def _likeness_of_changes() -> tuple[FloatArray, FloatArray, FloatArray]:
     return lags, exposures, np.stack([shape / np.linalg.norm(shape) for shape in shapes])
 
 
+@lru_cache(maxsize=2)  # A picture is asked again without the exposure that its file states.
 def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
     """Rows a slot and how far its line stands out, by the turns of the light, likeliest first."""
     import cv2
@@ -396,6 +397,7 @@ def slot_lines(strips: ColumnStrips) -> list[tuple[float, float]]:
     return distinct
 
 
+@lru_cache(maxsize=4)
 def _turns(strips: ColumnStrips, lag: int) -> tuple[Float32Array, ...]:
     """What has a line at the rate of the slots: products (C, n) of turns of the light over `lag` rows, and their size.
 
@@ -422,6 +424,7 @@ def _turns(strips: ColumnStrips, lag: int) -> tuple[Float32Array, ...]:
     return product, turns
 
 
+@lru_cache(maxsize=16)
 def along_the_line(
     strips: ColumnStrips, rows: float, reach: float, *, may_bend: bool
 ) -> tuple[float, FloatArray, float] | None:

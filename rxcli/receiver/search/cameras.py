@@ -26,6 +26,7 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.screen import geometry
+from rxcli.receiver.search.evidence import USUAL_COLUMNS
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.types import Clock, Float32Array, FloatArray, Frame, Lens, Remark, RowProfiles
 
@@ -75,7 +76,7 @@ def propose_cameras(
     context = FrameContext(cache, corners, UNKNOWN, options.screens)
     profiles = context.sample_columns(n_columns)
     with timer("blind"):
-        strips = _strips(context, profiles)
+        strips = cache.once(("strips", corners.tobytes(), n_columns), lambda: _strips(context, profiles))
     # A picture does not show the slot rate: the fastest screen represents all with the same packet length.
     screens = sorted(options.screens, key=lambda screen: -screen.slot_rate_hz)
     may_bend = may_bend and frame.mosaic is None
@@ -114,7 +115,8 @@ def cameras_by_slots(
     for n_columns in dict.fromkeys(screen.columns for screen in screens):
         profiles = unknown.sample_columns(n_columns)
         with context.timer("blind"):
-            hypotheses = propose_slots(_strips(unknown, profiles), may_bend=frame.mosaic is None)
+            every = max(n_columns // USUAL_COLUMNS, 1)
+            hypotheses = propose_slots(_strips(unknown, profiles, every), may_bend=frame.mosaic is None)
         for hypothesis in hypotheses:
             camera = estimated_camera(hypothesis, screens[0].slot_rate_hz, frame)
             yield from ((s, relabelled_camera(camera, s, frame)) for s in screens if s.columns == n_columns)
@@ -173,8 +175,10 @@ def settle_slots(
     return estimated_camera(found, screen.slot_rate_hz, frame), moved_slots
 
 
-def _strips(context: FrameContext, profiles: RowProfiles) -> ColumnStrips:
-    """Convert row profiles to strips in order of time."""
+def _strips(context: FrameContext, profiles: RowProfiles, every: int = 1) -> ColumnStrips:
+    """Convert row profiles to strips in order of time, of each `every`-th column."""
     frame, outlines = context.frame, context.outlines(len(profiles.light))
     x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
+    x = x.reshape(*profiles.light.shape)[::every].reshape(-1, x.shape[1])
+    profiles = profiles.of_columns(slice(None, None, every))
     return strips_of(profiles, x[:, ::-1] if context.camera.reversed else x, frame.width, frame.height)

@@ -37,9 +37,8 @@ class _Slots:
     context: FrameContext
     #: On the clock of a long packet whose payload is all that is in view.
     acquisition: Acquisition
-    #: (C, N) probability that each slot is lit; log evidence, and that of a slot against the unlikeliest phase.
+    #: (C, N) probability that each slot is lit; log evidence of a slot against the unlikeliest phase.
     lit: Float32Array
-    log_evidence: float
     lead: float
     #: Screens that may send them.
     screens: Sequence[ScreenProfile]
@@ -95,7 +94,7 @@ def _found(context: FrameContext, outlines: Sequence[Outline]) -> list[tuple[_Sl
     found: list[tuple[_Slots, Outline]] = []
     for outline in outlines:
         for by_camera in _cameras(replace(context, sampled_corners=outline.corners)):
-            found += [(slots, outline) for slots in _slots_by(by_camera)]
+            found += [(slots, outline) for slots in _slots_by(_exposures(by_camera))]
             if by_camera.camera.hypothesis and found and found[-1][0].lead > SETTINGS.poor_lead:
                 break
     return found
@@ -116,16 +115,6 @@ def _cameras(context: FrameContext) -> Iterable[FrameContext]:
     return ways.values()
 
 
-def _slots_by(context: FrameContext) -> Iterator[_Slots]:
-    """The slots of a context by the exposure that the light shows, if they stand out and are a part of a packet."""
-    found = [slots for by_exposure in _exposures(context) for slots in _at_likeliest_phase(by_exposure)]
-    if found:
-        found.sort(key=lambda slots: -slots.log_evidence)
-        likely = [slots for slots in found if slots.log_evidence > found[0].log_evidence - SETTINGS.cut_reach]
-        screens = tuple(screen for slots in likely for screen in slots.screens)
-        yield replace(found[0], context=replace(found[0].context, screens=screens), screens=screens)
-
-
 def _exposures(context: FrameContext) -> list[FrameContext]:
     """The frame by each exposure that the file may state: in seconds, so that it has other slots by each slot rate."""
     if context.camera.hypothesis is None or not context.frame.metadata.exposure_s:
@@ -136,21 +125,29 @@ def _exposures(context: FrameContext) -> list[FrameContext]:
     return [replace(context, camera=camera, screens=own) for camera, own in zip(cameras, groups, strict=True)]
 
 
-def _at_likeliest_phase(context: FrameContext) -> Iterator[_Slots]:
-    """The slots by the first screen of a context at their likeliest phase, if it stands out and they are a part."""
-    screen, camera = context.screens[0], context.camera
-    profiles = context.sample_columns(screen.columns)
+def _slots_by(contexts: Sequence[FrameContext]) -> Iterator[_Slots]:
+    """The slots by the exposure that the light shows, at their likeliest phase, if it stands out and they are a part.
+
+    Args:
+        contexts: the frame by each exposure; they differ in nothing else but their screens.
+    """
+    screen, camera = contexts[0].screens[0], contexts[0].camera
+    profiles = contexts[0].sample_columns(screen.columns)
     rows_per_slot = 1 / (screen.slot_rate_hz * camera.line_delay_s)
-    exposure_slots = camera.exposure_s * screen.slot_rate_hz
     top, bottom = sync.row_span(profiles)
     n_slots = int(np.ceil((bottom - top) / rows_per_slot)) + 1
-    # Else a whole header is in view, which the search would have found.
-    is_cut = n_slots < max(possible.packet_slots for possible in context.screens) + PREAMBLE_SLOTS
-    if not is_cut or n_slots <= SETTINGS.cut_symbols * SLOTS_PER_SYMBOL or exposure_slots > LONG_EXPOSURE_SLOTS:
+    # Where a whole header is in view, the search would have found it.
+    exposed = [
+        (context, context.camera.exposure_s * context.screens[0].slot_rate_hz)
+        for context in contexts
+        if n_slots < max(possible.packet_slots for possible in context.screens) + PREAMBLE_SLOTS
+    ]
+    exposed = [each for each in exposed if each[1] <= LONG_EXPOSURE_SLOTS]
+    if n_slots <= SETTINGS.cut_symbols * SLOTS_PER_SYMBOL or not exposed:
         return
     clock = Clock(
         rows_per_slot=rows_per_slot,
-        exposure_slots=exposure_slots,
+        exposure_slots=exposed[0][1],
         packet_slots=PREAMBLE_SLOTS + -(-n_slots // SLOTS_PER_SYMBOL) * SLOTS_PER_SYMBOL,
         row0=top,
         n_slots=n_slots,
@@ -163,17 +160,24 @@ def _at_likeliest_phase(context: FrameContext) -> Iterator[_Slots]:
     acquisition = Acquisition(screen, profiles, clock, (screen,))
     # The brighter half of the columns shows the phase as well.
     bright = acquisition.of_columns(acquisition.bright_columns)
-    clocks = [replace(bright.clock, row0=top - part * step) for part in range(n)]
-    evidence_of = [log_evidence for _, log_evidence in slots_of_any_kind(bright, clocks)]
-    lead = float(np.ptp(evidence_of)) / n_slots
-    if lead < SETTINGS.cut_lead:
+    clocks = [
+        replace(bright.clock, exposure_slots=slots, row0=top - part * step) for _, slots in exposed for part in range(n)
+    ]
+    by_phase = np.array([log_evidence for _, log_evidence in slots_of_any_kind(bright, clocks)]).reshape(-1, n)
+    by_phase *= screen.columns / bright.clock.delay_slots.size
+    leads, tops = np.ptp(by_phase, axis=1) / n_slots, by_phase.max(axis=1)
+    likely = np.flatnonzero((leads >= SETTINGS.cut_lead) & (tops > tops.max() - SETTINGS.cut_reach))
+    if not likely.size:
         return
-    best = int(np.argmax(evidence_of))
-    beside = peak_offset(*np.take(evidence_of, [best - 1, best, best + 1], mode="wrap"))
-    clock = replace(clock, row0=clocks[best].row0 - float(np.clip(beside, -0.5, 0.5)) * step)
-    ((lit, log_evidence),) = slots_of_any_kind(acquisition, [clock])
-    lit, lead = clock.on_grid(lit[None]), lead * screen.columns / bright.clock.delay_slots.size
-    yield _Slots(context, replace(acquisition, clock=clock), lit, log_evidence, lead, context.screens)
+    likely = likely[np.argsort(-tops[likely], kind="stable")]
+    likeliest, best = int(likely[0]), int(by_phase[likely[0]].argmax())
+    beside = peak_offset(*np.take(by_phase[likeliest], [best - 1, best, best + 1], mode="wrap"))
+    row0 = top - (best + float(np.clip(beside, -0.5, 0.5))) * step
+    clock = replace(clock, exposure_slots=exposed[likeliest][1], row0=row0)
+    ((lit, _),) = slots_of_any_kind(acquisition, [clock])
+    screens = tuple(possible for number in likely for possible in exposed[number][0].screens)
+    context = replace(exposed[likeliest][0], screens=screens)
+    yield _Slots(context, replace(acquisition, clock=clock), clock.on_grid(lit[None]), float(leads[likeliest]), screens)
 
 
 def _settled(slots: _Slots, outline: Outline) -> _Slots:
@@ -187,7 +191,7 @@ def _settled(slots: _Slots, outline: Outline) -> _Slots:
             layout = ColumnLayout(screen.columns, screen.light_spread, screen.aspect)
             outline = replace(outline, corners=corners_by_slots(outline, layout, clock, slots.lit, lens))
         context = replace(context, camera=camera, sampled_corners=outline.corners)
-        better = next(_at_likeliest_phase(context), slots)
+        better = next(_slots_by([context]), slots)
         if better.lead <= slots.lead:
             break
         slots = better

@@ -70,8 +70,8 @@ class SearchSettings(msgspec.Struct, frozen=True):
     #: Fit by which the last clock may be behind the first; and log evidence by which one exposure of the slots excludes
     #: another: right ones lead by -2 to 2100 over half of it, by 1300 and more over twice of it.
     cut_reach: float = 300.0
-    #: Least log evidence of a slot against the unlikeliest phase: light without slots has 0.4, cut packets 18 and more.
-    cut_lead: float = 1.0
+    #: Least log evidence of a slot against the unlikeliest phase: light without slots has 0.8, cut packets 14 and more.
+    cut_lead: float = 2.0
     #: Room light that is tried where no header is in view, relative to its estimate, which counts what is lit in part.
     cut_room_lights: tuple[float, ...] = (1.0, 0.8, 0.6)
     #: Natural logarithm of the ratio of readouts, stated and estimated, up to which they may agree: cameras state that
