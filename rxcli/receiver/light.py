@@ -138,18 +138,6 @@ def sees_dark_header(places: FloatArray, exposure_slots: float) -> BoolArray:
     return np.asarray(np.abs(places - (_DARK_FROM + _DARK_TO) / 2) <= reach)
 
 
-@cache
-def exposed_from(exposure_slots: float, samples_per_slot: int) -> FloatArray:
-    """(Q, reach + 1) weight of slots n .. n + reach in samples whose exposure starts in slot n.
-
-    Args:
-        exposure_slots: length of the exposure, slots.
-        samples_per_slot: samples per slot, Q; a sample is a mean over its own length.
-    """
-    length = max(exposure_slots, _MIN_WIDTH)
-    return _taps(length / 2, np.arange(np.ceil(length) + 1), length, samples_per_slot)
-
-
 def _taps(start: float, slots: FloatArray, exposure_slots: float, samples_per_slot: int) -> FloatArray:
     """(Q, slots) weight of slots in the samples of a slot that begins with the middle of an exposure at `start`."""
     fine = (np.arange(samples_per_slot * _FINE) + 0.5) / (samples_per_slot * _FINE)
@@ -157,22 +145,24 @@ def _taps(start: float, slots: FloatArray, exposure_slots: float, samples_per_sl
     return np.asarray(exposure_shares(centre, slots, max(exposure_slots, _MIN_WIDTH)).mean(axis=1))
 
 
-def light_through(taps: FloatArray, lit: Float32Array, before: int = 0) -> Float32Array:
-    """(C, (N + before) * Q) light of slots (C, N) by weights (Q, n) of those from `before` earlier on; 0.5 beyond."""
-    padded = np.pad(lit, ((0, 0), (before, taps.shape[1] - 1)), constant_values=0.5)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, taps.shape[1], axis=1)
-    return np.asarray((windows @ taps.T.astype(np.float32)).reshape(len(lit), -1), np.float32)
-
-
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """Response of slots through the exposure, on a grid of Q samples per slot.
+    """Response of slots through the exposure, on a grid of Q samples per slot; a sample is a mean over its own length.
 
     The exposure of sample q of metric n is centred at n - memory / 2 + (q + 1/2) / Q.
     """
 
     #: (Q, memory + 1) weight of the slots n - memory .. n in sample q of metric n.
     taps: FloatArray
+    #: Slots of these before those in which an exposure starts: the memory, or none.
+    n_before: int
+
+    @staticmethod
+    @cache
+    def by_start(exposure_slots: float, samples_per_slot: int) -> Exposure:
+        """The response on a grid where exposures start: taps (Q, reach + 1) of the slots n .. n + reach."""
+        length = max(exposure_slots, _MIN_WIDTH)
+        return Exposure(_taps(length / 2, np.arange(np.ceil(length) + 1), length, samples_per_slot), 0)
 
     @staticmethod
     def of(exposure_slots: float, samples_per_slot: int) -> Exposure:
@@ -184,7 +174,8 @@ class Exposure:
         """
         # Odd, so that metrics lie between samples; the slots at both ends are hardly exposed.
         isi_memory = int(np.clip(2 * np.ceil((exposure_slots - _MEMORY_SLOTS) / 2) + 1, 1, _MAX_MEMORY))
-        return Exposure(_taps(-isi_memory / 2, np.arange(-isi_memory, 1.0), exposure_slots, samples_per_slot))
+        taps = _taps(-isi_memory / 2, np.arange(-isi_memory, 1.0), exposure_slots, samples_per_slot)
+        return Exposure(taps, isi_memory)
 
     @property
     def isi_memory(self) -> int:
@@ -198,8 +189,12 @@ class Exposure:
 
     def mean_light(self, lit: Float32Array) -> Float32Array:
         """(C, N * Q) mean of slots (C, N), or of their probabilities, over the exposure; 0.5 beyond the ends."""
-        skip, n = self.isi_memory * self.samples_per_slot // 2, lit.shape[1] * self.samples_per_slot
-        return np.ascontiguousarray(light_through(self.taps, lit, self.isi_memory)[:, skip : skip + n])
+        (q, n_taps), n = self.taps.shape, lit.shape[1]
+        padded = np.pad(lit, ((0, 0), (self.n_before, n_taps - 1)), constant_values=0.5)
+        windows = np.lib.stride_tricks.sliding_window_view(padded, n_taps, axis=1)
+        light = (windows @ self.taps.T.astype(np.float32)).reshape(len(lit), -1)
+        skip = self.n_before * q // 2
+        return np.ascontiguousarray(light[:, skip : skip + n * q], np.float32)
 
 
 def column_light(n_strips: int, n_columns: int, light_spread: float) -> FloatArray:

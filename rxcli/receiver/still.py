@@ -294,7 +294,9 @@ def follow_picture(
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), q, ratios.by_start(clock))
     lit = clock.on_grid(reception.posteriors.lit)
     if acquisition.profiles.has_row_noise and not reception.is_long:
-        samples = denoise.remove_row_noise(samples, ratios.whole_light(lit, clock, model.crosstalk, q), model)
+        by_start = replace(model, exposure=Exposure.by_start(clock.exposure_slots, q))
+        whole = by_start.expected(lit, clock, np.arange(len(lit))).whole
+        samples = denoise.remove_row_noise(samples, whole, model)
     bursts = ratios.burst_samples(samples, clock, model, columns, lit)
     bursts = _with_weights(bursts, reception.posteriors.w_log_prob[columns], are_known=keeps_weights)
     # Of long exposures columns are too rarely right to show what they have in common.

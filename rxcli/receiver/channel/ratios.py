@@ -10,7 +10,7 @@ from rxcli.numerics import mean_of_valid
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.channel.model import ObservationModel
 from rxcli.receiver.channel.settings import SETTINGS
-from rxcli.receiver.light import Crosstalk, exposed_from, light_through
+from rxcli.receiver.light import Exposure
 from rxcli.types import BurstSamples, Clock, Float32Array, IntArray, SlotSamples
 
 
@@ -40,7 +40,7 @@ def burst_samples(
         third = light.shape[1] // 3
         own = np.clip(light[:, third : light.shape[1] - third].mean(axis=1) / 2, 0, 1)
     else:
-        own = light_through(exposed_from(clock.exposure_slots, q), lit)
+        own = Exposure.by_start(clock.exposure_slots, q).mean_light(lit)
     neighbours = model.crosstalk.from_neighbours(own, columns, clock.delay_slots * q)
     if len(light) > columns.size:
         light, mean, above = light[columns], mean[columns], above[columns]
@@ -75,10 +75,3 @@ def _by_lane(values: NDArray[np.floating[Any]], clock: Clock, q: int) -> Float32
         for place, copy in enumerate(np.flatnonzero(clock.burst == burst)):
             out[:, :, burst, :, place] = by_copy[:, :, :, copy].transpose(3, 0, 1, 2)
     return out.reshape(clock.packet_slots, q, n_bursts * n_columns, most * n_strips)
-
-
-def whole_light(lit: Float32Array, clock: Clock, crosstalk: Crosstalk, samples_per_slot: int) -> Float32Array:
-    """(C, S, N * Q) light of all columns in their strips per unit of picture, by the start of exposures."""
-    own = light_through(exposed_from(clock.exposure_slots, samples_per_slot), lit)
-    delays = clock.delay_slots * samples_per_slot
-    return crosstalk.from_neighbours(own, np.arange(len(lit)), delays) + crosstalk.own * own[:, None]

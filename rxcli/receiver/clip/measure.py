@@ -46,31 +46,23 @@ class Measured:
 
 
 def measured_by(
-    picture: PlacedPicture,
-    observed: Observed,
-    clock: Clock,
-    lit: Float32Array | None,
-    max_misfit: float,
-    isi_memory: int,
-    *,
-    adapts: bool = False,
+    observed: Observed, clock: Clock, lit: Float32Array | None, max_misfit: float, isi_memory: int, adapts: bool
 ) -> Measured | None:
     """Correct clock, response and noise of a frame by its decided slots `lit` (C, N); then likelihoods.
 
     If it `adapts`, the picture is adapted to the frame by its decided slots. None where the light does not fit the
     decisions: another scene, or something in front of the screen.
     """
-    rows, light = observed.pose.rows, observed.light
+    rows, picture, columns = observed.pose.rows, observed.picture, observed.columns
     positions = known_picture.row_positions(rows, clock)
-    columns = observed.columns if picture is observed.picture else picture.solve(light)
     if lit is None:
         lit = known_picture.first_decision(columns, positions, clock)
     fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
     if adapts or fit.centre < SETTINGS.faded:
         expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit)
         if adapts:
-            picture = picture.adapted(light, expected.light, clock.rows_per_slot)
-        columns = picture.solve_again(light, expected.light, clock.rows_per_slot)
+            picture = picture.adapted(observed.light, expected.light, clock.rows_per_slot)
+        columns = picture.solve_again(observed.light, expected.light, clock.rows_per_slot)
         if adapts:
             lit = known_picture.first_decision(columns, positions, clock)
         fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)

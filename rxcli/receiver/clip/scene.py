@@ -145,7 +145,7 @@ class TrackedScreen:
                 measured, joint = self._measured_jointly(observed, clock, bursts, max_misfit)
             else:
                 clock = clock.by_copy if bursts is None else replace(clock, burst=bursts)
-                measured = self._measured(picture, observed, clock, None, max_misfit)
+                measured = self._measured(observed, clock, None, max_misfit)
             if measured is None:
                 return None
             self._measure_place(likely if joint else picture, light, measured.expected)
@@ -185,10 +185,6 @@ class TrackedScreen:
         llr = by_copy_llr(lit)
         clock = in_bursts(acquisition, clock, llr) if bursts is None else replace(clock, burst=bursts)
         found, _ = detect_jointly(replace(acquisition, clock=clock), model, weights, lit)
-        if self._changes:  # A picture that is wrong in detail is worse than none.
-            free, _ = detect_jointly(self._acquired(observed.light, pose, None, clock), model, weights, lit)
-            better = np.flatnonzero(free.log_evidence > found.log_evidence)
-            found = found.with_columns(better, free.of_columns(better))
         self._w_log_prob, lit = found.w_log_prob, clock.on_grid(found.lit)
         joint, positions = JointSlots(clock.burst, found), known_picture.row_positions(pose.rows, clock)
         fit = known_picture.fit_response(observed.columns, lit, positions, clock.exposure_slots)
@@ -200,13 +196,14 @@ class TrackedScreen:
         return Measured(clock, llr, snr, expected), joint
 
     def _measured(
-        self, picture: PlacedPicture, observed: Observed, clock: Clock, lit: Float32Array | None, max_misfit: float
+        self, observed: Observed, clock: Clock, lit: Float32Array | None, max_misfit: float
     ) -> Measured | None:
         """Measure a frame by the known picture or, where pictures change, by what the frame shows of it."""
-        if not (self._changes or observed.changed):
-            return measured_by(picture, observed, clock, lit, max_misfit, self._isi_memory)
-        found = measured_by(observed.picture, observed, clock, lit, max_misfit, self._isi_memory, adapts=True)
-        return found and replace(found, llr=self._with_doubtful(observed, found.clock, found.llr))
+        adapts = self._changes or observed.changed
+        found = measured_by(observed, clock, lit, max_misfit, self._isi_memory, adapts)
+        if found is None or not adapts:
+            return found
+        return replace(found, llr=self._with_doubtful(observed, found.clock, found.llr))
 
     def _with_doubtful(self, observed: Observed, clock: Clock, llr: Float32Array) -> Float32Array:
         """Slots, those of doubtful columns detected jointly without a picture as well.
@@ -354,7 +351,7 @@ class TrackedScreen:
         observed = Observed(view.context, pose, view.light, picture, picture.solve(view.light), view.changed)
         if observed.header_contrast(clock) < SETTINGS.min_header:
             return
-        measured = self._measured(picture, observed, clock, known, SETTINGS.misfit)
+        measured = self._measured(observed, clock, known, SETTINGS.misfit)
         if measured is not None:
             view.clock, view.snr, view.llr, view.tracked = measured.clock, measured.snr, measured.llr, True
 

@@ -34,7 +34,7 @@ from rxcli.protocol import (
 )
 from rxcli.receiver.decode.detect import posteriors_of, weight_shares
 from rxcli.receiver.decode.settings import SURVIVORS, SurvivorSettings
-from rxcli.receiver.light import exposed_from
+from rxcli.receiver.light import Exposure
 from rxcli.types import BoolArray, BurstPosteriors, BurstSamples, Float32Array, FloatArray, IntArray
 
 #: Likelihood of a path against its lane's best one below which it is dropped: right paths come back from far.
@@ -271,7 +271,7 @@ def _forward(samples: BurstSamples, settings: SurvivorSettings, kinds: tuple[boo
 def _light_of(samples: BurstSamples) -> tuple[Callable[[IntArray, IntArray], Float32Array], int]:
     """Light in the Q samples (Q, n) by lanes of `samples` and last slots (n,); and slots beyond that of its start."""
     exposures, kind = np.unique(_exposures(samples), return_inverse=True)
-    taps = [exposed_from(exposure_slots, samples.light.shape[1]) for exposure_slots in exposures.tolist()]
+    taps = [Exposure.by_start(exposure_slots, samples.light.shape[1]).taps for exposure_slots in exposures.tolist()]
     reach = max(each.shape[1] for each in taps) - 1
     patterns = slot_patterns(reach)
     levels = np.stack([patterns[:, : each.shape[1]] @ each.T for each in taps]).astype(np.float32)

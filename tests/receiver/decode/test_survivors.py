@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rxcli.protocol import HEADER, WEIGHTS, bits_per_symbol, codebook, dimming_symbol
 from rxcli.receiver.decode.settings import SURVIVORS
 from rxcli.receiver.decode.survivors import detect, detect_against_free, detect_free, log_evidence_of, side_by_side
-from rxcli.receiver.light import exposed_from
+from rxcli.receiver.light import Exposure
 from rxcli.types import BurstSamples
 
 Q, STRIPS = 2, 4
@@ -25,7 +25,7 @@ def packet(index: NDArray[np.int64], w: int) -> NDArray[np.int64]:
 
 def exposed(slots: NDArray[np.int64], exposure_slots: float, n_slots: int) -> NDArray[np.float64]:
     """(n_slots, Q) share of lit slots in exposures by their start."""
-    taps = exposed_from(exposure_slots, Q)
+    taps = Exposure.by_start(exposure_slots, Q).taps
     return np.stack([taps @ slots[n : n + taps.shape[1]] for n in range(n_slots)])
 
 
@@ -123,7 +123,7 @@ def test_evidence_of_arbitrary_slots_is_that_of_all_slots(exposure_slots: float)
     rng = np.random.default_rng(14)
     burst = samples([packet(np.array([77]), 5)], exposure_slots, rng, 0.06, 0.08)
     burst.valid[:12] = burst.valid[18:] = 0
-    n_shown = 6 + exposed_from(exposure_slots, Q).shape[1] - 1
+    n_shown = 6 + Exposure.by_start(exposure_slots, Q).taps.shape[1] - 1
     log = []
     for number in range(1 << n_shown):
         slots = np.zeros(40, np.int64)
