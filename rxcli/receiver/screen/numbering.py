@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from math import erfc
 
 import numpy as np
 
@@ -37,6 +38,8 @@ _DARK, _FAINT, _MIN_FAINT_SD = 0.1, 0.05, 0.0004
 #: Standard deviations of the sides of a bright part against the screen's, screen widths, and of its height, screen
 #: heights.
 _SIDE_SD, _HEIGHT_SD = 0.0125, 0.03
+#: Standard deviation of a grid at the screen's sides, screen widths, of 31 grids of 100 columns.
+_GRID_SD = 0.004
 #: Distances from the screen's middle, screen widths, within which edges lie that it has in pairs: of films and of the
 #: screen's frame.
 _PAIRED = (0.22, 0.58)
@@ -174,7 +177,11 @@ def first_columns(light: LightProfile, n_columns: int, aspect: float) -> tuple[I
     Log-odds are comparable between numbers of columns.
     """
     starts, terms, fills = first_column_features(light, n_columns, aspect)
-    return starts, terms @ numbering_weights(), fills
+    odds = terms @ numbering_weights()
+    # A grid that is half a column off at the screen's sides counts one more, or one less.
+    slip = np.log(max(erfc(0.5 / (_GRID_SD * n_columns * 2**0.5)) / 2, TINY))
+    beside = np.pad(odds, 1, constant_values=-np.inf) + slip
+    return starts, np.logaddexp.reduce([odds, beside[:-2], beside[2:]]), fills
 
 
 def first_column_features(light: LightProfile, n_columns: int, aspect: float) -> tuple[IntArray, FloatArray, bool]:

@@ -485,6 +485,15 @@ def test_a_side_counts_as_hidden_by_the_share_of_a_column_outside_the_picture() 
     assert [round(hidden[first], 2) for first in (-3, -2, -1, 0, 1)] == [1, 0.06, 0, 0.44, 1]
 
 
+@pytest.mark.parametrize(("n_columns", "is_sure"), [(20, True), (100, False)])
+def test_columns_may_be_one_off_where_they_are_narrow(n_columns: int, is_sure: bool) -> None:
+    light = profile(0, n_columns, film=(0, n_columns), right=n_columns + 2)
+    light = replace(light, picture_middle=n_columns / 2)
+    columns, log_odds, _ = first_columns(light, n_columns, ASPECT)
+    assert columns[log_odds.argmax()] == 0
+    assert (1 / np.exp(log_odds - log_odds.max()).sum() > 0.9) == is_sure
+
+
 def test_the_shipped_weights_are_those_of_the_features() -> None:
     assert len(numbering_weights()) == first_column_features(profile(2, 18), 20, ASPECT)[1].shape[1]
 
