@@ -55,11 +55,13 @@ class SurvivorSettings(msgspec.Struct, frozen=True):
     drift_per_slot: float = 0.06
     first_deviation: float = 0.3
     degrees: float = 1.5
-    #: Limits: variance of the picture relative to its square; the picture against the local light, more or less.
+    #: Limits: variance of the picture relative to its square; the picture against the level, more or less.
     max_variance: float = 4.0
     max_picture: float = 1e3
 
 
 SETTINGS, SURVIVORS, QUICK_SURVIVORS = DecodeSettings(), SurvivorSettings(), SurvivorSettings(max_paths=12)
+#: Of four samples per slot, whose errors are correlated more than those of two.
+FINE_SURVIVORS = SurvivorSettings(information=0.7)
 #: Where only ranks are asked.
 GLANCE = SurvivorSettings(max_paths=8)

@@ -60,7 +60,7 @@ class _Paths:
     w: IntArray
     slots: IntArray
     log_likelihood: FloatArray
-    #: Picture relative to the local light, and its variance.
+    #: Picture relative to the level of its light, and its variance.
     picture: Float32Array
     variance: Float32Array
 
