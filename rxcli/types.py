@@ -347,6 +347,8 @@ class BurstPosteriors:
     bit_llr: FloatArray
     #: (B, C) float64: log-likelihood ratio of the headers against arbitrary slots; 0 where no header is visible.
     header_llr: FloatArray
+    #: (B, C, N, 128) float32: probability of the words of the column's weight; 0 beyond its codebook.
+    words: Float32Array
 
     def of_columns(self, columns: IntArray) -> BurstPosteriors:
         """Posteriors of some columns."""

@@ -38,6 +38,7 @@ def posteriors_of(n_bursts: int, n_columns: int, n_symbols: int, **known: Any) -
         "index": np.zeros((*shape, n_symbols), np.int64),
     }
     usual |= {"log_prob": np.zeros((*shape, n_symbols)), "bit_llr": np.zeros((*shape, n_symbols, 7))}
+    usual["words"] = np.full((*shape, n_symbols, 128), 1 / 128, np.float32)
     return BurstPosteriors(header_llr=known.pop("header_llr", np.zeros(shape)), **usual | known)
 
 

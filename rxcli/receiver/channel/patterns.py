@@ -112,9 +112,10 @@ def word_metrics(metrics: Float32Array, llr: Float32Array, odds: Float32Array, c
 
 
 def of_words(metrics: Float32Array) -> Float32Array:
-    """(..., words) log-likelihood of the words in `codewords` beyond that of their slots, from `word_metrics`."""
+    """(..., words) log-likelihood of the words in `codewords` beyond that of their slots, 0 on average."""
     isi_memory = next(n for n in count() if (SLOTS_PER_SYMBOL + n) << (n + 1) == metrics.shape[-1])
-    return np.asarray(metrics @ _word_patterns(isi_memory))
+    found = metrics @ _word_patterns(isi_memory)
+    return np.asarray(found - found.mean(axis=-1, keepdims=True))
 
 
 @cache

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from rxcli.protocol import PREAMBLE_SLOTS
-from rxcli.receiver.channel import llr_of
+from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codewords
+from rxcli.receiver import channel
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.views import View
 from rxcli.receiver.decode import assemble, confidence, detect
@@ -24,6 +24,9 @@ class Burst:
     number: int
     #: (C, packet) log-likelihood ratio of every slot, of all frames together.
     llr: FloatArray
+    #: (C, N, n) for the words of symbols, beyond their slots: `channel.word_metrics`, or log-likelihoods of joint
+    #: detections, whose slots have no ratios; (C, 1, 1) without any.
+    words: Float32Array
     #: (C, packet) number of observations of each slot.
     n_observed: IntArray
     frames: tuple[int, ...]
@@ -36,6 +39,7 @@ class Burst:
         return Burst(
             self.number,
             self.llr + burst.llr,
+            _added(self.words, burst.words),
             self.n_observed + burst.n_observed,
             self.frames + burst.frames,
             np.union1d(self.copies, burst.copies),
@@ -45,7 +49,7 @@ class Burst:
     @cached_property
     def posteriors(self) -> BurstPosteriors:
         """Of this burst alone."""
-        return detect.detect(self.llr[None])
+        return detect.detect(self.llr[None], of_words=_by_word(self.words)[None])
 
     @property
     def certain(self) -> BoolArray:
@@ -73,6 +77,15 @@ class Burst:
         )
 
 
+def _added(words: Float32Array, more: Float32Array) -> Float32Array:
+    return words + more if words.shape == more.shape else _by_word(words) + _by_word(more)
+
+
+def _by_word(words: Float32Array) -> Float32Array:
+    """(C, N, words) log-likelihoods of words, which joint detections give at once; (C, 1, 1) without any."""
+    return words if words.shape[-1] in (1, len(codewords()[0])) else channel.of_words(words)
+
+
 def bursts_of(view: View) -> list[Burst]:
     """What a frame shows of its bursts."""
     assert view.numbers is not None
@@ -80,12 +93,21 @@ def bursts_of(view: View) -> list[Burst]:
     shows_payload = view.shown[..., PREAMBLE_SLOTS:].any(axis=(1, 2))
     # Copies that were detected together under another assignment count by themselves.
     joint = view.joint if view.joint and np.array_equal(view.joint.burst, view.clock.burst) else None
-    bursts = []
+    bursts: list[Burst] = []
+    if joint is not None:
+        words = detect.log_words(joint.posteriors)
+    elif view.words is not None:
+        words = view.clock.added(view.words)[:, :, PREAMBLE_SLOTS // SLOTS_PER_SYMBOL :]
+    else:
+        words = np.zeros((len(llr), 1, 1, 1), np.float32)
     for index, number in enumerate(view.numbers.tolist()):
         which = view.clock.burst == index
         copies, n_observed = view.first_copy + np.flatnonzero(which & shows_payload), view.shown[which].sum(axis=0)
-        own = llr[index] if joint is None else llr_of(joint.posteriors.lit[index]) * (n_observed > 0)
-        bursts.append(Burst(number, own, n_observed, (view.context.frame.index,), copies, view.tracked))
+        own = llr[index]
+        if joint is not None:
+            own = channel.llr_of(joint.posteriors.lit[index]) * (n_observed > 0)
+            own[:, PREAMBLE_SLOTS:] = 0
+        bursts.append(Burst(number, own, words[index], n_observed, (view.context.frame.index,), copies, view.tracked))
     return bursts
 
 

@@ -43,6 +43,8 @@ class Measured:
     snr: Float32Array
     #: (C, R) light of the columns by the decided slots.
     expected: Float32Array
+    #: (C, copies, symbols, n) see `SlotLikelihoods.words`.
+    words: Float32Array | None = None
 
 
 def measured_by(
@@ -75,7 +77,7 @@ def measured_by(
     if judged is None:
         return None
     found = known_picture.slot_likelihoods(judged, expected, clock, isi_memory)
-    return Measured(clock, found.llr, found.snr, expected.light)
+    return Measured(clock, found.llr, found.snr, expected.light, found.words)
 
 
 def shown_slots(inside: BoolArray, positions: FloatArray, clock: Clock) -> IntArray:

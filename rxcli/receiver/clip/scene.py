@@ -163,6 +163,7 @@ class TrackedScreen:
             tracked=joint is None,
             changed=self._changes,
             joint=joint,
+            words=measured.words,
         )
         if joint is not None:
             self.update(view, lambda: clock.on_grid(joint.posteriors.lit))
@@ -203,7 +204,7 @@ class TrackedScreen:
         found = measured_by(observed, clock, lit, max_misfit, self._isi_memory, adapts)
         if found is None or not adapts:
             return found
-        return replace(found, llr=self._with_doubtful(observed, found.clock, found.llr))
+        return replace(found, words=None, llr=self._with_doubtful(observed, found.clock, found.llr))
 
     def _with_doubtful(self, observed: Observed, clock: Clock, llr: Float32Array) -> Float32Array:
         """Slots, those of doubtful columns detected jointly without a picture as well.
@@ -353,7 +354,13 @@ class TrackedScreen:
             return
         measured = self._measured(observed, clock, known, SETTINGS.misfit)
         if measured is not None:
-            view.clock, view.snr, view.llr, view.tracked = measured.clock, measured.snr, measured.llr, True
+            view.clock, view.snr, view.llr, view.tracked, view.words = (
+                measured.clock,
+                measured.snr,
+                measured.llr,
+                True,
+                measured.words,
+            )
 
 
 def _placed(picture: known_picture.KnownPicture, pose: Pose) -> PlacedPicture:

@@ -54,6 +54,8 @@ class View:
     first_copy: int = 0
     #: Of a long exposure; the slots are then those of every copy by itself.
     joint: JointSlots | None = None
+    #: (C, copies, symbols, n) see `SlotLikelihoods.words`; None where slots are all that is known.
+    words: Float32Array | None = None
     #: How sure the length of packets is by this frame alone; None where the picture was known.
     framing: Framing | None = None
     #: (B,) numbers of the frame's bursts, once known.

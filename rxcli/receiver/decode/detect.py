@@ -27,6 +27,8 @@ from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, In
 
 #: Most bits of a symbol.
 MAX_BITS = max(map(bits_per_symbol, WEIGHTS))
+#: Least probability of a word: paths that were dropped are not impossible.
+_MIN_DOUBT = 1e-8
 
 
 def detect(
@@ -43,6 +45,8 @@ def detect(
     payload = np.asarray(llr[..., PREAMBLE_SLOTS:], np.float32).reshape(n_bursts, n_columns, -1, SLOTS_PER_SYMBOL)
     words, starts = codewords()
     score = payload @ words.T.astype(np.float32)
+    if of_words is not None:
+        score = score + of_words
     top = score.max(axis=-1, keepdims=True)
     by_weight = np.add.reduceat(np.exp(score - top), starts, axis=-1)
     # Against dark slots, all bursts together.
@@ -53,9 +57,6 @@ def detect(
     if candidates is not None:
         w_log_evidence[~candidates] = -np.inf
     log_evidence = np.logaddexp.reduce(w_log_evidence, axis=1)
-
-    if of_words is not None:
-        score += of_words
 
     def posterior(w: int, columns: IntArray) -> FloatArray:
         own = score[:, columns, :, starts[w - 1] : starts[w - 1] + (1 << bits_per_symbol(w))].astype(np.float64)
@@ -91,16 +92,30 @@ def posteriors_of(
     shape = (*header_llr.shape, n_symbols)
     lit = np.empty((*header_llr.shape, PREAMBLE_SLOTS + n_symbols * SLOTS_PER_SYMBOL), np.float32)
     index, log_prob = np.empty(shape, np.int64), np.empty(shape)
-    bit_llr = np.full((*shape, MAX_BITS), np.nan)
+    bit_llr, words = np.full((*shape, MAX_BITS), np.nan), np.zeros((*shape, 1 << MAX_BITS), np.float32)
     for w in np.unique(weights).tolist():
         columns = np.flatnonzero(weights == w)
         posterior, n_bits = of_words(w, columns), bits_per_symbol(w)
+        words[:, columns, :, : 1 << n_bits] = posterior
         lit[:, columns, :PREAMBLE_SLOTS] = preamble_slots(w)
         lit[:, columns, PREAMBLE_SLOTS:] = (posterior @ codebook(w)).reshape(len(lit), columns.size, -1)
         index[:, columns] = best = posterior.argmax(axis=-1)
         log_prob[:, columns] = log_of_best(posterior, best)
         bit_llr[:, columns, :, :n_bits] = llr_of_bits(posterior, n_bits)
-    return BurstPosteriors(weights, w_log_prob, log_evidence, lit, index, log_prob, bit_llr, header_llr)
+    return BurstPosteriors(weights, w_log_prob, log_evidence, lit, index, log_prob, bit_llr, header_llr, words)
+
+
+def log_words(posteriors: BurstPosteriors) -> Float32Array:
+    """(B, C, N, words) log probability of the words in `codewords`, over that of any word of the column's weight."""
+    (words, starts), n_symbols = codewords(), posteriors.index.shape[2]
+    less = np.maximum(posteriors.w_log_prob - posteriors.w_log_prob.max(axis=1, keepdims=True), np.log(_MIN_DOUBT))
+    weight = words.sum(axis=1) - WEIGHTS[0]
+    out = np.tile((less[:, None, weight] / n_symbols).astype(np.float32), (len(posteriors.index), 1, n_symbols, 1))
+    for w in np.unique(posteriors.w).tolist():
+        columns, n_words = np.flatnonzero(posteriors.w == w), 1 << bits_per_symbol(w)
+        own = np.maximum(posteriors.words[:, columns, :, :n_words], _MIN_DOUBT) * n_words
+        out[:, columns, :, starts[w - 1] : starts[w - 1] + n_words] = np.log(own)
+    return out
 
 
 def preamble_slots(w: int) -> NDArray[np.uint8]:

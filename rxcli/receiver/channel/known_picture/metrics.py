@@ -8,7 +8,7 @@ from rxcli.protocol import slot_patterns
 from rxcli.receiver.channel.known_picture.exposure import ExpectedLight, SlotView
 from rxcli.receiver.channel.known_picture.picture import ColumnLight
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods
-from rxcli.receiver.channel.patterns import slot_llr
+from rxcli.receiver.channel.patterns import propagated, word_metrics
 from rxcli.types import Clock, Float32Array, IntArray
 
 
@@ -29,7 +29,9 @@ def slot_likelihoods(observed: ColumnLight, expected: ExpectedLight, clock: Cloc
     # Squared contrast over variance of a slot is the precision of the rows around; a row of every slot shows it.
     some = observed.precision[:, :: max(int(clock.rows_per_slot), 1)]
     snr = np.median(some, axis=1, keepdims=True) * np.float32(clock.rows_per_slot)
-    return SlotLikelihoods(slot_llr(np.concatenate(parts)), snr)
+    metrics = np.concatenate(parts)
+    llr, odds = propagated(metrics)
+    return SlotLikelihoods(llr, snr, words=word_metrics(metrics, llr, odds, clock))
 
 
 def _row_metrics(
