@@ -460,6 +460,13 @@ def test_films_twins_and_photographs_stand_in_one_table(tmp_path: Path) -> None:
     assert names == {"pan-3-0-0.mp4", "pan-3-0-0-twin.mp4"}
 
 
+def test_pictures_without_data_are_saved_with_their_truth(tmp_path: Path) -> None:
+    arguments = ["nodata", "--count", "1", "--seed", "3", "--way", "bound", "--quiet", "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(benchmark, [*arguments, "--save", str(tmp_path / "saved")]).exit_code in (0, None)
+    truth = json.loads(next((tmp_path / "saved").glob("*.truth.json")).read_text())
+    assert isinstance(truth["frames"][0]["start_slot"], float)
+
+
 # Two checkouts.
 
 

@@ -101,7 +101,7 @@ def write_case(case: Case, stem: Path) -> list[Path]:
     truths = known or [case.whole_truth or case.truth] * len(paths)
     for path, truth in zip(paths, truths, strict=True):
         if truth is not None:
-            write_whole(truth_path(path), msgspec.json.encode(truth))
+            write_whole(truth_path(path), msgspec.json.encode(truth, enc_hook=float))
     return paths
 
 
