@@ -91,7 +91,7 @@ def test_packets_decide_between_hypotheses(tmp_path: Path, monkeypatch: pytest.M
         found = _chosen(frame, proposed, monkeypatch)
         assert isinstance(found, Found)
         chosen = found.best.hypothesis.camera.hypothesis
-        assert chosen.rows_per_slot == right.rows_per_slot
+        assert chosen.number == right.number
 
 
 def test_without_packets_there_is_no_camera_but_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
