@@ -168,10 +168,7 @@ def slots_of_any_kind(acquisition: Acquisition, clocks: Sequence[Clock]) -> list
 
 
 def _joint_initial_pass(acquisition: Acquisition) -> Reception:
-    """Make a pass that detects slots and picture jointly: first every copy by itself, then the copies of bursts.
-
-    Where whole copies by themselves show no packets, they are all that is detected.
-    """
+    """Make a pass that detects slots and picture jointly: first every copy by itself, then the copies of bursts."""
     clock = acquisition.clock
     samples = sync.sample_slots(acquisition.profiles, clock, STILL.coarse_samples)
     model = _light_model(acquisition, clock, samples)
@@ -180,33 +177,39 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     model = replace(model, black_level=black_level)
     columns = np.arange(len(samples.light))
     by_start = sync.sample_slots(acquisition.profiles, ratios.by_start(clock), STILL.coarse_samples)
-    contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
-    snr = _joint_snr(model.over_black(samples), samples, model, clock)
-
-    def received(clock: Clock, bursts: BurstSamples, llr: Float32Array | None = None) -> Reception:
-        posteriors, free = survivors.detect_against_free(bursts, QUICK_SURVIVORS)
-        # Noise is no evidence, and leaves most symbols open.
-        observed = assemble.slots_observed(samples, clock)[..., PREAMBLE_SLOTS:] > 0
-        is_shown = observed.reshape(*posteriors.log_prob.shape, -1).all(axis=-1)
-        is_decided = (posteriors.log_prob > np.log(0.5)) & is_shown
-        share = is_decided.sum(axis=(0, 2)) / np.maximum(is_shown.sum(axis=(0, 2)), 1) * ~dark_columns(snr)
-        posteriors = replace(posteriors, log_evidence=(posteriors.log_evidence - free) * share)
-        llr = channel.llr_of(clock.on_grid(posteriors.lit)) if llr is None else llr
-        joint = np.ones(len(columns), bool)
-        return Reception(clock, samples, contrast, posteriors, snr, model, llr, joint, is_long=True)
-
-    alone = received(clock.by_copy, ratios.burst_samples(by_start, clock.by_copy, model, columns))
-    if alone.n_observed.all(axis=-1).any() and packet_llr(alone) < SETTINGS.min_packets_llr:
-        return alone
-    lit, w_log_prob, some = alone.clock.on_grid(alone.posteriors.lit), alone.posteriors.w_log_prob, _some(columns)
+    single = clock.by_copy
+    alone = survivors.detect(ratios.burst_samples(by_start, single, model, columns), QUICK_SURVIVORS)
+    lit, some = single.on_grid(alone.lit), _some(columns)
 
     def of_way(clock: Clock) -> BurstSamples:
-        return _of_weights(ratios.burst_samples(by_start, clock, model, some, lit), w_log_prob[some])
+        return _of_weights(ratios.burst_samples(by_start, clock, model, some, lit), alone.w_log_prob[some])
 
-    ways = _ways_by_evidence(acquisition, clock, alone.llr, of_way)
+    llr = channel.llr_of(lit)
+    ways = _ways_by_evidence(acquisition, clock, llr, of_way)
     (clock, _), by_evidence = ways[0], [(way.burst, gain) for way, gain in ways]
-    bursts = _with_weights(ratios.burst_samples(by_start, clock, model, columns, lit), w_log_prob)
-    return replace(received(clock, bursts, alone.llr), bursts_by_evidence=by_evidence)
+    bursts = _with_weights(ratios.burst_samples(by_start, clock, model, columns, lit), alone.w_log_prob)
+    posteriors, free = survivors.detect_against_free(bursts, QUICK_SURVIVORS)
+    contrast = sync.contrast(samples.light, samples.valid, STILL.coarse_samples, model.noise.sigma)
+    snr = _joint_snr(model.over_black(samples), samples, model, clock)
+    # Noise is no evidence, and leaves most symbols open.
+    observed = assemble.slots_observed(samples, clock)[..., PREAMBLE_SLOTS:] > 0
+    is_shown = observed.reshape(*posteriors.log_prob.shape, -1).all(axis=-1)
+    is_decided = (posteriors.log_prob > np.log(0.5)) & is_shown
+    share = is_decided.sum(axis=(0, 2)) / np.maximum(is_shown.sum(axis=(0, 2)), 1) * ~dark_columns(snr)
+    posteriors = replace(posteriors, log_evidence=(posteriors.log_evidence - free) * share)
+    joint = np.ones(len(columns), bool)
+    return Reception(
+        clock,
+        samples,
+        contrast,
+        posteriors,
+        snr,
+        model,
+        llr,
+        joint,
+        is_long=True,
+        bursts_by_evidence=by_evidence,
+    )
 
 
 def detect_jointly(
