@@ -46,9 +46,11 @@ def codebook(w: int) -> NDArray[np.uint8]:
 
 @cache
 def codewords() -> tuple[NDArray[np.uint8], list[int]]:
-    """(n, 10) uint8 codewords of all weights, one codebook after the other, and the first word of each."""
+    """(n, 10) uint8 codewords of all weights, one codebook after the other, read-only; and the first word of each."""
     books = [codebook(w) for w in WEIGHTS]
-    return np.concatenate(books), np.cumsum([0, *map(len, books[:-1])]).tolist()
+    words = np.concatenate(books)
+    words.flags.writeable = False
+    return words, np.cumsum([0, *map(len, books[:-1])]).tolist()
 
 
 def slot_patterns(isi_memory: int) -> NDArray[np.uint8]:

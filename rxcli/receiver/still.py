@@ -88,16 +88,15 @@ def decode(
     skipped = {"certain_columns": n_columns - candidates.size, "dark_columns": candidates.size - lit.size}
     # Joint detection gives no slots by themselves, and developing mixes rows that are few per slot.
     by_slot = adds_up or initial.clock.rows_per_slot < STILL.min_joint_rows
-    if lit.size and by_slot and not initial.is_long:
-        reception, *_ = without_row_noise(acquisition, reception, lit)
-        if (doubtful := np.intersect1d(lit, doubtful_columns(reception))).size:
-            reception, *_ = without_row_noise(acquisition, reception, doubtful)
-    elif lit.size:
-        # Noise of rows is estimated from the slots: again once these are better.
-        for _ in range(1 + (acquisition.profiles.has_row_noise and not initial.is_long)):
+    # Noise of rows is estimated from the slots: again once these are better.
+    for _ in range(1 + ((by_slot or acquisition.profiles.has_row_noise) and not initial.is_long)):
+        if not lit.size:
+            break
+        if by_slot and not initial.is_long:
+            reception, *_ = without_row_noise(acquisition, reception, lit)
+        else:
             reception = follow_picture(acquisition, reception, lit, keeps_weights=keeps_weights)
-            if not (lit := np.intersect1d(lit, doubtful_columns(reception))).size:
-                break
+        lit = np.intersect1d(lit, doubtful_columns(reception))
     return replace(reception, skipped={name: count for name, count in skipped.items() if count})
 
 
@@ -198,18 +197,8 @@ def _joint_initial_pass(acquisition: Acquisition) -> Reception:
     share = is_decided.sum(axis=(0, 2)) / np.maximum(is_shown.sum(axis=(0, 2)), 1) * ~dark_columns(snr)
     posteriors = replace(posteriors, log_evidence=(posteriors.log_evidence - free) * share)
     joint = np.ones(len(columns), bool)
-    return Reception(
-        clock,
-        samples,
-        contrast,
-        posteriors,
-        snr,
-        model,
-        llr,
-        joint,
-        is_long=True,
-        bursts_by_evidence=by_evidence,
-    )
+    found = Reception(clock, samples, contrast, posteriors, snr, model, llr, joint, is_long=True)
+    return replace(found, bursts_by_evidence=by_evidence)
 
 
 def detect_jointly(
@@ -506,7 +495,7 @@ def detected(
     `words` is (C, copies, symbols, n), see `channel.SlotLikelihoods`.
     """
     if words is not None:
-        words = channel.of_words(clock.added(words)[:, :, PREAMBLE_SLOTS // SLOTS_PER_SYMBOL :])
+        words = channel.beyond_slots(clock.added(words)[:, :, PREAMBLE_SLOTS // SLOTS_PER_SYMBOL :])
     found = detect.detect(clock.by_burst(llr), weights, words)
     free = detect.free_log_evidence(llr, found.w / SLOTS_PER_SYMBOL) + np.log(len(WEIGHTS))
     return replace(found, log_evidence=found.log_evidence - free)

@@ -24,18 +24,18 @@ slots add to these.
 
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods
 from rxcli.receiver.channel.model import ObservationModel, estimate_black_level, estimate_tails
-from rxcli.receiver.channel.patterns import initial_llr, lit_of, llr_of, of_words
+from rxcli.receiver.channel.patterns import beyond_slots, initial_llr, lit_of, llr_of
 from rxcli.receiver.channel.steady import without_steady_light
 
 __all__ = [
     "ObservationModel",
     "SlotLikelihoods",
+    "beyond_slots",
     "estimate_black_level",
     "estimate_tails",
     "initial_llr",
     "lit_of",
     "llr_of",
-    "of_words",
     "slot_likelihoods",
     "without_steady_light",
 ]

@@ -89,7 +89,7 @@ def word_metrics(metrics: Float32Array, llr: Float32Array, odds: Float32Array, c
         clock: of their N slots.
 
     Returns:
-        (C, copies, symbols, (10 + memory) * patterns), see `of_words`.
+        (C, copies, symbols, (10 + memory) * patterns), see `beyond_slots`.
     """
     n, isi_memory = SLOTS_PER_SYMBOL, len(odds) - 1
 
@@ -111,7 +111,7 @@ def word_metrics(metrics: Float32Array, llr: Float32Array, odds: Float32Array, c
     return np.moveaxis(by_pattern, 0, -1).reshape(len(llr), clock.n_copies, clock.packet_slots // n, -1)
 
 
-def of_words(metrics: Float32Array) -> Float32Array:
+def beyond_slots(metrics: Float32Array) -> Float32Array:
     """(..., words) log-likelihood of the words in `codewords` beyond that of their slots, 0 on average."""
     isi_memory = next(n for n in count() if (SLOTS_PER_SYMBOL + n) << (n + 1) == metrics.shape[-1])
     found = metrics @ _word_patterns(isi_memory)

@@ -49,7 +49,7 @@ class Burst:
     @cached_property
     def posteriors(self) -> BurstPosteriors:
         """Of this burst alone."""
-        return detect.detect(self.llr[None], of_words=_by_word(self.words)[None])
+        return detect.detect(self.llr[None], beyond_slots=_by_word(self.words)[None])
 
     @property
     def certain(self) -> BoolArray:
@@ -83,7 +83,7 @@ def _added(words: Float32Array, more: Float32Array) -> Float32Array:
 
 def _by_word(words: Float32Array) -> Float32Array:
     """(C, N, words) log-likelihoods of words, which joint detections give at once; (C, 1, 1) without any."""
-    return words if words.shape[-1] in (1, len(codewords()[0])) else channel.of_words(words)
+    return words if words.shape[-1] in (1, len(codewords()[0])) else channel.beyond_slots(words)
 
 
 def bursts_of(view: View) -> list[Burst]:

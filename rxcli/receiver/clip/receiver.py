@@ -140,11 +140,8 @@ class ClipReceiver:
         if isinstance(acquired, Failure):
             return acquired
         options, acquisition, timer = self._camera.options, acquired.acquisition, cache.timer
-        tracks, is_joint, denoised = (
-            _can_track(acquired, options),
-            decides_jointly(acquired.initial.clock),
-            frozenset[int](),
-        )
+        tracks, is_joint = _can_track(acquired, options), decides_jointly(acquired.initial.clock)
+        denoised = frozenset[int]()
         # Slots of copies that were detected jointly, or of a picture that changes, do not add up.
         adds_up = not (is_joint or self._has_changed)
         with timer("detect"):

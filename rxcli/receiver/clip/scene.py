@@ -354,13 +354,8 @@ class TrackedScreen:
             return
         measured = self._measured(observed, clock, known, SETTINGS.misfit)
         if measured is not None:
-            view.clock, view.snr, view.llr, view.tracked, view.words = (
-                measured.clock,
-                measured.snr,
-                measured.llr,
-                True,
-                measured.words,
-            )
+            view.clock, view.snr, view.tracked = measured.clock, measured.snr, True
+            view.llr, view.words = measured.llr, measured.words
 
 
 def _placed(picture: known_picture.KnownPicture, pose: Pose) -> PlacedPicture:

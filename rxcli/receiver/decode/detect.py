@@ -28,25 +28,25 @@ from rxcli.types import BoolArray, BurstPosteriors, Float32Array, FloatArray, In
 #: Most bits of a symbol.
 MAX_BITS = max(map(bits_per_symbol, WEIGHTS))
 #: Least probability of a word: paths that were dropped are not impossible.
-_MIN_DOUBT = 1e-8
+_MIN_WORD = 1e-8
 
 
 def detect(
-    llr: Float32Array | FloatArray, candidates: BoolArray | None = None, of_words: Float32Array | None = None
+    llr: Float32Array | FloatArray, candidates: BoolArray | None = None, beyond_slots: Float32Array | None = None
 ) -> BurstPosteriors:
     """Detect weights and symbols of every burst and column.
 
     Args:
         llr: (B, C, packet) log-likelihood ratio of each slot, copies added.
         candidates: (C, 9) weights to consider, all by default.
-        of_words: (B, C, payload symbols, words) log-likelihood of the words in `codewords` beyond that of their slots.
+        beyond_slots: (B, C, payload symbols, words) log-likelihood of words in `codewords` beyond that of their slots.
     """
     n_bursts, n_columns, _ = llr.shape
     payload = np.asarray(llr[..., PREAMBLE_SLOTS:], np.float32).reshape(n_bursts, n_columns, -1, SLOTS_PER_SYMBOL)
     words, starts = codewords()
     score = payload @ words.T.astype(np.float32)
-    if of_words is not None:
-        score = score + of_words
+    if beyond_slots is not None:
+        score = score + beyond_slots
     top = score.max(axis=-1, keepdims=True)
     by_weight = np.add.reduceat(np.exp(score - top), starts, axis=-1)
     # Against dark slots, all bursts together.
@@ -108,12 +108,12 @@ def posteriors_of(
 def log_words(posteriors: BurstPosteriors) -> Float32Array:
     """(B, C, N, words) log probability of the words in `codewords`, over that of any word of the column's weight."""
     (words, starts), n_symbols = codewords(), posteriors.index.shape[2]
-    less = np.maximum(posteriors.w_log_prob - posteriors.w_log_prob.max(axis=1, keepdims=True), np.log(_MIN_DOUBT))
+    less = np.maximum(posteriors.w_log_prob - posteriors.w_log_prob.max(axis=1, keepdims=True), np.log(_MIN_WORD))
     weight = words.sum(axis=1) - WEIGHTS[0]
     out = np.tile((less[:, None, weight] / n_symbols).astype(np.float32), (len(posteriors.index), 1, n_symbols, 1))
     for w in np.unique(posteriors.w).tolist():
         columns, n_words = np.flatnonzero(posteriors.w == w), 1 << bits_per_symbol(w)
-        own = np.maximum(posteriors.words[:, columns, :, :n_words], _MIN_DOUBT) * n_words
+        own = np.maximum(posteriors.words[:, columns, :, :n_words], _MIN_WORD) * n_words
         out[:, columns, :, starts[w - 1] : starts[w - 1] + n_words] = np.log(own)
     return out
 

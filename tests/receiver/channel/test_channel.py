@@ -11,7 +11,7 @@ from row_profiles import Link, Shot, random_link, row_profiles, sigma_of
 
 from rxcli.protocol import codewords, slot_patterns
 from rxcli.receiver import channel
-from rxcli.receiver.channel.patterns import by_pattern, of_words, propagated, slot_llr, word_metrics
+from rxcli.receiver.channel.patterns import beyond_slots, by_pattern, propagated, slot_llr, word_metrics
 from rxcli.receiver.channel.picture import PictureSums, by_place, in_time, predict_picture
 from rxcli.receiver.light import Crosstalk, Exposure, NoiseModel, dark_sigma
 from rxcli.receiver.sync import clock as sync
@@ -371,7 +371,7 @@ def test_words_agree_with_enumeration_of_all_slots(seed: int) -> None:
     exact = np.log(np.bincount(number, np.exp(total))[words @ (1 << np.arange(10))])
     clock = Clock(5.0, 1.0, 20, 0.0, n_slots, 0, np.zeros(1, np.int64), np.zeros(1), 10.0)
     llr, odds = propagated(metrics)
-    found = llr[0, :10] @ words.T + of_words(word_metrics(metrics, llr, odds, clock))[0, 0, 0]
+    found = llr[0, :10] @ words.T + beyond_slots(word_metrics(metrics, llr, odds, clock))[0, 0, 0]
     # The slots of the next word come from three passes, which is nearly exact; a constant does not matter.
     np.testing.assert_allclose(found - found.mean(), exact - exact.mean(), atol=0.3)
     by_slot = llr[0, :10] @ words.T
