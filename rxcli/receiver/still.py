@@ -15,7 +15,7 @@ from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel
 from rxcli.receiver.channel import denoise, ratios
 from rxcli.receiver.decode import assemble, detect, survivors
-from rxcli.receiver.decode.settings import FINE_SURVIVORS, GLANCE, QUICK_SURVIVORS
+from rxcli.receiver.decode.settings import FINE_SURVIVORS, QUICK_SURVIVORS
 from rxcli.receiver.decode.settings import SURVIVORS as survivor_settings
 from rxcli.receiver.frame.acquisition import Acquisition, noise_of
 from rxcli.receiver.frame.passes import Reception, dark_columns, packet_llr
@@ -328,7 +328,7 @@ def _refined(acquisition: Acquisition, reception: Reception, columns: NDArray[np
         return _of_weights(ratios.burst_samples(samples, clock, model, some, lit), weights)
 
     def likeliest(parts: list[BurstSamples]) -> int:
-        return int(survivors.log_evidence_of(parts, GLANCE).sum(axis=1).argmax())
+        return int(survivors.log_evidence_of(parts, QUICK_SURVIVORS).sum(axis=1).argmax())
 
     level = reception.model.black_level
     number = likeliest([bursts(clock, number, level) for number, clock in enumerate(exposed)])
@@ -346,7 +346,7 @@ def _ways_by_evidence(
     ways = [way for way, _ in sync.possible_bursts(clock, llr, acquisition.repeats)]
     if len(ways) == 1:
         return [(ways[0], 0.0)]
-    by_column, most = survivors.log_evidence_of([bursts(way) for way in ways], GLANCE), STILL.max_column_gain
+    by_column, most = survivors.log_evidence_of([bursts(way) for way in ways], QUICK_SURVIVORS), STILL.max_column_gain
     gains = np.clip(by_column - by_column[0], -most, most).sum(axis=1).tolist()
     return sorted(zip(ways, gains, strict=True), key=lambda way: -way[1])
 

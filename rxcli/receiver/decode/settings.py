@@ -63,5 +63,3 @@ class SurvivorSettings(msgspec.Struct, frozen=True):
 SETTINGS, SURVIVORS, QUICK_SURVIVORS = DecodeSettings(), SurvivorSettings(), SurvivorSettings(max_paths=12)
 #: Of four samples per slot, whose errors are correlated more than those of two.
 FINE_SURVIVORS = SurvivorSettings(information=0.7)
-#: Where only ranks are asked.
-GLANCE = SurvivorSettings(max_paths=8)
