@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 
+from rxcli.receiver.plane import tone_to_light
 from rxcli.types import Float32Array, Frame
 
 _GREEN = 1
@@ -25,6 +26,4 @@ def frame_light(frame: Frame) -> Float32Array:
         total, count = (cv2.boxFilter(part, -1, window, normalize=False) for part in (pixels * green, green))
         return np.asarray(np.clip((total / count - black) / (white - black), 0, None), np.float32)
     values = np.clip((pixels - np.float32(frame.black)) / np.float32(frame.white - frame.black), 0, None)
-    if frame.linear:
-        return np.asarray(values, np.float32)
-    return np.asarray(np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4), np.float32)
+    return np.asarray(tone_to_light("linear" if frame.linear else "srgb", values), np.float32)

@@ -1,8 +1,6 @@
 """Groups of commands: help without arguments, suggestions for mistyped names."""
 
-import inspect
 from collections.abc import Iterable
-from contextlib import suppress
 from typing import Any
 
 import click
@@ -34,31 +32,15 @@ class PlainContext(click.Context):
     formatter_class = PlainFormatter
 
 
-def _described(command: click.Command) -> None:
-    """Take the help from the source, as Python keeps no docstrings with -OO."""
-    if command.help is None and command.callback is not None:
-        import ast
-        import textwrap
-
-        with suppress(OSError, SyntaxError):
-            source = ast.parse(textwrap.dedent(inspect.getsource(command.callback)))
-            command.help = ast.get_docstring(source.body[0])  # type: ignore[arg-type]
-
-
 class SuggestingGroup(click.Group):
     """A group that names the nearest command where one is mistyped, and lays out its commands' help."""
 
     context_class = PlainContext
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        _described(self)
-
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         command = super().get_command(ctx, cmd_name)
         if command is not None:
             command.context_class = PlainContext
-            _described(command)
         return command
 
     def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:

@@ -91,7 +91,7 @@ class _LazyGroup(SuggestingGroup):
             result = super().invoke(context)
             sys.stdout.flush()
         except BrokenPipeError:
-            raise _PipeClosedError from None  # before click makes an exit code of its own of it
+            raise _PipeClosedError from None  # before click turns it into its own exit code
         return result
 
 

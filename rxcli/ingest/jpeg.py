@@ -108,7 +108,7 @@ def decode_uncommon(data: bytes, source: object) -> tuple[NDArray[Any], float]:
 
 
 def with_height(data: bytes) -> bytes:
-    """The picture with its height in its header, where it is stated behind the first scan."""
+    """The picture with its height in its header, where it has 0 there and the height behind the first scan (DNL)."""
     frame = next((start for marker, start, _ in segments(data) if marker in _FRAMES), 0)
     found = _HEIGHT.search(data, frame) if frame and data[frame + 1 : frame + 3] == b"\0\0" else None
     if found is None:

@@ -353,7 +353,7 @@ class _Pool:
         return results
 
     def close(self) -> None:
-        """End the workers, which have nothing of their own and ignore gentler signals; none is started any more."""
+        """Kill the workers, which hold nothing that could be lost and ignore gentler signals; start no more."""
         with self._starting:
             self._closed = True
         for process in self._processes:

@@ -38,15 +38,6 @@ def test_help_of_every_command_breaks_no_words_at_80_characters(
         assert not any(line.endswith("...") and "Usage:" not in line for line in lines), arguments
 
 
-def test_help_is_there_where_python_keeps_no_docstrings() -> None:
-    for arguments in ([], ["decode"], ["calibrate", "lens"], ["profiles"]):
-        plain, stripped = (
-            subprocess.run([sys.executable, *flags, *COMMAND[1:], *arguments, "--help"], env=ENVIRONMENT, stdout=-1)
-            for flags in ([], ["-OO"])
-        )
-        assert stripped.stdout == plain.stdout != b"", arguments
-
-
 def test_ctrl_c_before_the_program_has_begun_is_no_traceback(tmp_path: Path) -> None:
     """A library that it loads first stands for the moment."""
     (tmp_path / "click.py").write_text(

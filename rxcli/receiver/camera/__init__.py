@@ -9,11 +9,13 @@ from rxcli.receiver.camera.camera import camera_profile, in_time_order, lens_of,
 from rxcli.receiver.camera.curvature import curvature_terms
 from rxcli.receiver.camera.fit import settle
 from rxcli.receiver.camera.proposals import CameraHypothesis, in_phase, propose, propose_slots
+from rxcli.receiver.camera.stripes import Stripes
 from rxcli.receiver.camera.strips import ColumnStrips, strips_of
 
 __all__ = [
     "CameraHypothesis",
     "ColumnStrips",
+    "Stripes",
     "camera_profile",
     "curvature_terms",
     "in_phase",

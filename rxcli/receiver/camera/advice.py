@@ -3,15 +3,15 @@
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.receiver.camera.proposals import stripe_rows
 from rxcli.receiver.camera.settings import SETTINGS
+from rxcli.receiver.camera.stripes import Stripes
 from rxcli.receiver.camera.strips import ColumnStrips, levelled
 from rxcli.types import BoolArray, Float32Array, FloatArray, Remark
 
 
-def why_not(strips: ColumnStrips) -> Remark:
+def why_not(stripes: Stripes) -> Remark:
     """Why no clock was found, by what the picture looks like."""
-    likeness, lit = stripe_likeness(strips)
+    likeness, lit = stripe_likeness(stripes.strips)
     striped = lit & (likeness > SETTINGS.striped_likeness)
     if not lit.any():
         return Remark("screen_dark")
@@ -19,8 +19,7 @@ def why_not(strips: ColumnStrips) -> Remark:
         return Remark("no_stripes")
     if striped[lit].mean() < SETTINGS.striped_share:
         return Remark("part_striped")
-    width = stripe_rows(strips)
-    if width < SETTINGS.half_width_slots[0] * SETTINGS.min_rows_per_slot:
+    if (width := stripes.half_width) < SETTINGS.half_width_slots[0] * SETTINGS.min_rows_per_slot:
         return Remark("narrow_stripes", {"rows": width, "min_rows_per_slot": SETTINGS.min_rows_per_slot})
     return Remark("no_headers")
 

@@ -31,6 +31,12 @@ LENS_PRECISION: FloatArray = np.diag(np.array([0.3, 0.6, 1.5e-3, 1.5e-3]) ** -2.
 LENS_PRECISION[:2, :2] += 0.2**-2
 
 
+def tried_bends(strips: ColumnStrips) -> FloatArray:
+    """(B, 1) bends of the stripes that are tried, in units of `UNIT_BEND`; none is in the middle."""
+    most = SETTINGS.max_bend
+    return (np.linspace(-most, most, SETTINGS.n_bends) if strips.may_bend else np.zeros(1))[:, None]
+
+
 def straightened(strips: ColumnStrips, level: Float32Array, curvature: FloatArray) -> Float32Array:
     """(M, R) levelled light read along the bent stripes: every row of the result is one sensor row, 0 out of view."""
     return _moved(level, _moved_rows(strips, 1, curvature)) if curvature.any() else level
@@ -41,7 +47,7 @@ def likeliest_bend(strips: ColumnStrips, level: Float32Array) -> FloatArray:
     strips_per_column = level.shape[0] // strips.n_columns
     level = np.ascontiguousarray(level[::strips_per_column])
     moved = _moved_rows(strips, strips_per_column, UNIT_BEND)
-    bends = np.linspace(-SETTINGS.max_bend, SETTINGS.max_bend, SETTINGS.n_bends)[1::2]
+    bends = tried_bends(strips)[1::2, 0]
     straight = (_moved(level, np.float32(size) * moved) for size in bends)
     return np.asarray(bends[np.argmax([(light[:-1] * light[1:]).sum() for light in straight])] * UNIT_BEND)
 

@@ -26,8 +26,6 @@ def settle(
     clock: Clock,
     lit: Float32Array,
     light_spread: float,
-    *,
-    may_bend: bool = True,
 ) -> tuple[CameraHypothesis, float]:
     """The hypothesis fitted to decoded slots, and how far that moves the clock anywhere on the screen, slots.
 
@@ -39,7 +37,6 @@ def settle(
         clock: on which the slots stand, rows in readout order.
         lit: (C, N) probability that each slot of the clock's grid is lit.
         light_spread: sigma of the Gaussian that a column's light falls off with, column pitches.
-        may_bend: whether the camera may have taken a distortion out, as it cannot from a mosaic.
     """
     model = _Model(
         joined(strips, max(1, int(clock.rows_per_slot / SETTINGS.rows_per_width))),
@@ -53,8 +50,9 @@ def settle(
     straight, bent = np.array([0, 1]), np.arange(2, start.size)
     # A longer one is known better by the changes of the light, and rows per slot and bend by the line of these.
     is_long = exposure > LONG_EXPOSURE_SLOTS
+    may_bend = strips.may_bend and not is_long
     if is_long:
-        straight, may_bend = straight[:1], False
+        straight = straight[:1]
     else:
         exposure, exposure_sd = model.exposure(start, exposure)
         exposure = max(exposure, least)

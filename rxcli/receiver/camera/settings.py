@@ -36,7 +36,7 @@ class EstimateSettings(msgspec.Struct, frozen=True):
     max_line: float = 30.0
     #: Strength of the slots' line that noise reaches in one of ten pictures, ln(10 * 2000 bins).
     min_slot_line: float = 9.9
-    #: Bends that are tried by the slots' line, the middle one none; by the likeness of columns, every second.
+    #: Bends that are tried by the lines of the slots, the middle one none; by the likeness of columns, every second.
     n_bends: int = 25
     #: Clocks this close, relative, are one; hypotheses that are proposed; and the score that further ones need, as most
     #: of noise have 30 to 45, and right ones 60 and more where a whole packet is in view.
@@ -61,12 +61,11 @@ class EstimateSettings(msgspec.Struct, frozen=True):
     #: Percentile of the light that counts as black; least light above it.
     dark_percent: float = 0.5
     min_light: float = 1e-4
-    #: Slots of a block whose phase is that of its middle; fewest rows of a slot whose phase shows; k2 of the bends that
-    #: are tried, times k1; relative distances of rows a slot from their line, and from the clock of a short exposure,
-    #: up to which they are sought, and between two that are tried; steps from there.
+    #: Slots of a block whose phase is that of its middle; fewest rows of a slot whose phase shows; relative distances
+    #: of rows a slot from their line, and from the clock of a short exposure, up to which they are sought, and between
+    #: two that are tried; steps from there.
     block_slots: float = 6.0
     min_phase_rows: float = 3.0
-    bend_shares: tuple[float, ...] = (0.0, -0.5, -1.0, -2.0)
     off_line: float = 0.08
     off_clock: float = 0.012
     step_off: float = 5e-4

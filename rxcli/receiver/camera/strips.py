@@ -28,6 +28,8 @@ class ColumnStrips:
     #: Size of the picture.
     width: int
     height: int
+    #: Whether the camera may have taken a distortion out, as it cannot from a mosaic.
+    may_bend: bool = True
 
     @property
     def pitch(self) -> float:
@@ -35,7 +37,7 @@ class ColumnStrips:
         return float(self.rows[1] - self.rows[0]) if self.rows.size > 1 else 1.0
 
 
-def strips_of(profiles: RowProfiles, x: FloatArray, width: int, height: int) -> ColumnStrips:
+def strips_of(profiles: RowProfiles, x: FloatArray, width: int, height: int, *, may_bend: bool = True) -> ColumnStrips:
     """Strips from row profiles.
 
     Args:
@@ -43,6 +45,7 @@ def strips_of(profiles: RowProfiles, x: FloatArray, width: int, height: int) -> 
         x: (C * S, R) picture x of the strips' middles.
         width: of the picture, pixels.
         height: of the picture, rows.
+        may_bend: whether the camera may have taken a distortion out.
     """
     n_columns, n_strips, n_rows = profiles.light.shape
     join = max(n_strips // SETTINGS.strips_per_column, 1)
@@ -64,6 +67,7 @@ def strips_of(profiles: RowProfiles, x: FloatArray, width: int, height: int) -> 
         noise=NoiseModel(profiles.noise_floor, profiles.noise_slope).of_mean(pixels),
         width=width,
         height=height,
+        may_bend=may_bend,
     )
 
 

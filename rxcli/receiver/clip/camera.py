@@ -80,8 +80,8 @@ class Located:
         return self.evidence >= search_settings.plain and not self.is_open
 
     @property
-    def is_shown(self) -> bool:
-        """Whether the picture's texture hides nothing that further frames could show."""
+    def is_clear(self) -> bool:
+        """Whether further frames, from which the texture is known, could show no more of it."""
         is_known = self.context.camera.hypothesis is None
         return self.is_plain or (is_known and (not self.is_open or shows_little(self.context)))
 

@@ -45,7 +45,8 @@ class Ledger:
         self.start: Start | None = None
         #: Probability that the screen's columns are numbered right.
         self.certainty = 1.0
-        #: Number of first frames of a scene to hold back; and number that is held back now, 0: none.
+        #: Number of first frames of a scene whose results are held back until its picture is known, at first; and
+        #: number that holds now, 0 once the picture is known.
         self._n_first = SETTINGS.first_frames if "tracking" in options.skip else 0
         self._n_held = self._n_first
 

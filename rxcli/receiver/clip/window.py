@@ -65,11 +65,12 @@ def first_place(source: Source, camera: ClipCamera, *, may_wait: bool) -> tuple[
     """
     frames, n_searched = source.ahead(1), 1
     located = camera.locate(FrameCache(frames[0]))
-    if may_wait and not (isinstance(located, Located) and located.is_shown):
+    if may_wait and not (isinstance(located, Located) and located.is_clear):
         frames = source.ahead(SETTINGS.n_for_texture)
-        flat = _Hidden(camera, located, frames, CommonTexture(frames, DEFAULT_TONE)).shown if len(frames) > 1 else None
-        if flat is not None:
-            located, n_searched = flat, len(frames)
+        if len(frames) > 1:
+            together = _FirstFrames(camera, located, frames, CommonTexture(frames, DEFAULT_TONE))
+            if (found := together.without_texture) is not None:
+                located, n_searched = found, len(frames)
     while isinstance(located, Located) and n_searched < _n_needed(located):
         frames = source.ahead(max(len(frames), n_searched + 1))
         if n_searched == len(frames):
@@ -130,7 +131,7 @@ def agreeing(places: Sequence[Place]) -> list[Place]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Hidden:
+class _FirstFrames:
     """First frames, the texture that they have in common, and what the first of them shows alone."""
 
     camera: ClipCamera
@@ -139,9 +140,9 @@ class _Hidden:
     texture: CommonTexture
 
     @property
-    def shown(self) -> Located | None:
-        """The first frame as it is without the texture; None where that is not more."""
-        alone, found = self.alone, self._without_texture()
+    def without_texture(self) -> Located | None:
+        """What the first frame shows without the texture; None where that is no more than it shows alone."""
+        alone, found = self.alone, self._agreed_without_texture()
         if isinstance(alone, Located):
             if found is None and isinstance(alone.found, Found) and alone.is_long:
                 found = self._agreed_with_following(alone, alone.found)
@@ -164,7 +165,7 @@ class _Hidden:
         start = start_by(found, self.frames) if hides_headers(found) else None
         return Located(replace(alone.outline, corners=corners), context, None, alone.framing, start=start)
 
-    def _without_texture(self) -> Located | None:
+    def _agreed_without_texture(self) -> Located | None:
         """The first frame without its texture: surest camera and median outline of some frames that agree.
 
         None where it shows no packets.
@@ -186,7 +187,7 @@ class _Hidden:
             corners = np.median([each.corners for each in agreed], axis=0)
         outline = replace(best.outline, corners=corners, strips=None, grid=None)
         there = replace(camera, context=best.context).locate(flat, [outline], may_bend=False)
-        if isinstance(there, Located) and self._was_hidden(there) and Place.of(there).agrees(surest):
+        if isinstance(there, Located) and self._is_new(there) and Place.of(there).agrees(surest):
             return there
         context = replace(best.context, cache=flat, sampled_corners=outline.corners)
         return Located(outline, context, None, best.framing, start=start_by(best.found, self.frames))
@@ -200,7 +201,7 @@ class _Hidden:
             number = int(share * len(self.frames)) - int(share == 1)
             cache = FrameCache(self.texture.removed_from(number)) if number else flat
             found = self.camera.locate(cache, may_bend=False)
-            if isinstance(found, Located) and self._was_hidden(found):
+            if isinstance(found, Located) and self._is_new(found):
                 shown.append(Place.of(found, self.texture.shifts[number]))
                 agreed = agreeing(shown)
             elif alone is not None and not alone.is_long:
@@ -209,6 +210,6 @@ class _Hidden:
                 break
         return agreed
 
-    def _was_hidden(self, located: Located) -> bool:
-        """Whether packets were found that the texture had hidden."""
+    def _is_new(self, located: Located) -> bool:
+        """Whether packets were found that the first frame does not show alone."""
         return located.shows_packets and (located.is_long or isinstance(self.alone, Failure))

@@ -100,7 +100,7 @@ def find_rows(
     missing = 1 - (bottom - top)
     if missing > _WHOLE:
         return axis, (top - missing / 2, bottom + missing / 2), True
-    # A slightly too large outline costs less than omitted rows.
+    # A whole screen from either end of the light: a slightly too large outline costs less than omitted rows.
     return axis, (bottom - 1, top + 1), False
 
 

@@ -10,6 +10,7 @@ from rxcli.profiles import ScreenProfile, match_camera
 from rxcli.receiver.camera import (
     CameraHypothesis,
     ColumnStrips,
+    Stripes,
     in_phase,
     lens_of,
     propose,
@@ -75,22 +76,27 @@ def propose_cameras(
     frame, timer = cache.frame, cache.timer
     context = FrameContext(cache, corners, UNKNOWN, options.screens)
     profiles = context.sample_columns(n_columns)
+
+    def find_stripes() -> Stripes:
+        return Stripes(_strips(context, profiles, may_bend=may_bend))
+
     with timer("blind"):
-        strips = cache.once(("strips", corners.tobytes(), n_columns), lambda: _strips(context, profiles))
+        stripes = cache.once(("stripes", corners.tobytes(), n_columns, may_bend), find_stripes)
     # A picture does not show the slot rate: the fastest screen represents all with the same packet length.
     screens = sorted(options.screens, key=lambda screen: -screen.slot_rate_hz)
-    may_bend = may_bend and frame.mosaic is None
     with timer("blind"):
-        hypotheses = propose(strips, screens, frame.metadata.exposure_s, may_bend=may_bend)
+        hypotheses = propose(stripes, screens, frame.metadata.exposure_s)
     rates = {screen.packet_slots: screen.slot_rate_hz for screen in reversed(screens)}
-    ranked = sorted(hypotheses, key=lambda hypothesis: hypothesis.number)
-    cameras = [estimated_camera(hypothesis, rates[hypothesis.packet_slots], frame) for hypothesis in ranked]
-    stated = [number for number, camera in enumerate(cameras) if has_stated_readout(camera, frame)]
-    for hypothesis in [ranked[number] for number in stated] or ranked:
+
+    def camera_of(hypothesis: CameraHypothesis) -> FrameCamera:
+        return estimated_camera(hypothesis, rates[hypothesis.packet_slots], frame)
+
+    stated = [hypothesis for hypothesis in hypotheses if has_stated_readout(camera_of(hypothesis), frame)]
+    for hypothesis in stated or hypotheses:
         with timer("blind"):
-            hypothesis = in_phase(strips, hypothesis, may_bend=may_bend)
-        yield estimated_camera(hypothesis, rates[hypothesis.packet_slots], frame)
-    return why_not(strips)
+            precise = in_phase(stripes, hypothesis)
+        yield camera_of(precise)
+    return why_not(stripes)
 
 
 def has_stated_readout(camera: FrameCamera, frame: Frame) -> bool:
@@ -116,7 +122,7 @@ def cameras_by_slots(
         profiles = unknown.sample_columns(n_columns)
         with context.timer("blind"):
             every = max(n_columns // USUAL_COLUMNS, 1)
-            hypotheses = propose_slots(_strips(unknown, profiles, every), may_bend=frame.mosaic is None)
+            hypotheses = propose_slots(Stripes(_strips(unknown, profiles, every)))
         for hypothesis in hypotheses:
             camera = estimated_camera(hypothesis, screens[0].slot_rate_hz, frame)
             yield from ((s, relabelled_camera(camera, s, frame)) for s in screens if s.columns == n_columns)
@@ -165,20 +171,20 @@ def settle_slots(
         return camera, 0.0
     with context.timer("blind"):
         found, moved_slots = settle_hypothesis(
-            _strips(context, acquisition.profiles),
+            _strips(context, acquisition.profiles, may_bend=may_bend),
             camera.hypothesis,
             clock,
             lit,
             screen.light_spread,
-            may_bend=may_bend and frame.mosaic is None,
         )
     return estimated_camera(found, screen.slot_rate_hz, frame), moved_slots
 
 
-def _strips(context: FrameContext, profiles: RowProfiles, every: int = 1) -> ColumnStrips:
-    """Convert row profiles to strips in order of time, of each `every`-th column."""
+def _strips(context: FrameContext, profiles: RowProfiles, every: int = 1, *, may_bend: bool = True) -> ColumnStrips:
+    """Convert row profiles to strips in order of time, of each `every`-th column; from a mosaic stripes never bend."""
     frame, outlines = context.frame, context.outlines(len(profiles.light))
     x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
     x = x.reshape(*profiles.light.shape)[::every].reshape(-1, x.shape[1])
     profiles = profiles.of_columns(slice(None, None, every))
-    return strips_of(profiles, x[:, ::-1] if context.camera.reversed else x, frame.width, frame.height)
+    x = x[:, ::-1] if context.camera.reversed else x
+    return strips_of(profiles, x, frame.width, frame.height, may_bend=may_bend and frame.mosaic is None)

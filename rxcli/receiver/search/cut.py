@@ -116,7 +116,7 @@ def _cameras(context: FrameContext) -> Iterable[FrameContext]:
 
 
 def _exposures(context: FrameContext) -> list[FrameContext]:
-    """The frame by each exposure that the file may state: in seconds, so that it has other slots by each slot rate."""
+    """The frame under each slot rate of its screens: an exposure stated in seconds is other slots in each."""
     if context.camera.hypothesis is None or not context.frame.metadata.exposure_s:
         return [context]
     rates = dict.fromkeys(screen.slot_rate_hz for screen in context.screens)

@@ -115,17 +115,20 @@ class LinkTime:
             return self.stretch
         uneven = 2 * stamps_off / np.ptp(frames) * self.slot_rate_hz + SETTINGS.rate_slots
         scored = []
-        for stretch in range(1, SETTINGS.max_stretch + 1):
-            expected = stamp_s / stretch * self.slot_rate_hz
+        for factor in range(1, SETTINGS.max_stretch + 1):
+            expected = stamp_s / factor * self.slot_rate_hz
             passed = self.packet_slots * round((period - expected) / self.packet_slots)
-            off, limit = abs(period - passed - expected), uneven / stretch + SETTINGS.rate_share * expected
-            if off <= limit and stamp_s / stretch > min_frame_s:
-                score = -SETTINGS.rate_limits * off / limit - np.log(limit) + SETTINGS.slow_log_odds * (stretch > 1)
-                scored.append((score + packets(slots - passed * (frames - frames[0])), float(stretch)))
-        rival, best = sorted([(-np.inf, 0.0), (-np.inf, 0.0), *scored])[-2:]
-        self.stretch_log_odds = best[0] - rival[0] if scored else np.inf
-        is_slow = best[1] != 1
-        return None if not scored or (is_slow and self.stretch_log_odds < SETTINGS.sure_stretch) else best[1]
+            off, limit = abs(period - passed - expected), uneven / factor + SETTINGS.rate_share * expected
+            if off <= limit and stamp_s / factor > min_frame_s:
+                score = -SETTINGS.rate_limits * off / limit - np.log(limit) + SETTINGS.slow_log_odds * (factor > 1)
+                scored.append((score + packets(slots - passed * (frames - frames[0])), float(factor)))
+        if not scored:
+            self.stretch_log_odds = np.inf
+            return None
+        *_, (rival_score, _), (best_score, stretch) = sorted([(-np.inf, 1.0), *scored])
+        self.stretch_log_odds = best_score - rival_score
+        is_unsure = stretch != 1 and self.stretch_log_odds < SETTINGS.sure_stretch
+        return None if is_unsure else stretch
 
     def clock_at(
         self, frame: int, time_s: float, like: Clock, n_slots: int, top_row: float, later_slots: float = 0.0

@@ -365,13 +365,12 @@ def test_a_stated_readout_shows_the_slot_rate(
     """A picture shows rows per slot; the readout makes seconds of them, and the estimate stays that of the picture."""
     frame = Frame(np.zeros((1000, 40), np.uint8), "clip", metadata=Metadata(readout_s=stated_s))
     ways = (
-        blind.CameraHypothesis(4.0, length, False, np.zeros(4), 1.0, 9.0, 0.1, np.zeros(4), number=-length)
-        for length in (70, 130, 260)
+        blind.CameraHypothesis(4.0, length, False, np.zeros(4), 1.0, 9.0, 0.1, np.zeros(4)) for length in (260, 130, 70)
     )
     monkeypatch.setattr(cameras, "propose", lambda *_, **__: list(ways))
-    monkeypatch.setattr(cameras, "_strips", lambda *_: None)
+    monkeypatch.setattr(cameras, "_strips", lambda *_, **__: None)
     monkeypatch.setattr(cameras, "why_not", lambda *_: None)
-    monkeypatch.setattr(cameras, "in_phase", lambda _, hypothesis, **__: hypothesis)
+    monkeypatch.setattr(cameras, "in_phase", lambda _, hypothesis: hypothesis)
     monkeypatch.setattr(FrameContext, "sample_columns", lambda *_: None)
     options = ReceiverOptions(screens=tuple(screen for screen in SHIPPED if screen.columns == 20))
     proposed = list(cameras.propose_cameras(FrameCache(frame), np.zeros((4, 2)), options, 20))

@@ -230,6 +230,7 @@ class PlacedPicture:
         return self._solved(light, RowEquations.of(self.picture, gain, self.crosstalk))
 
     def _solved(self, light: Float32Array, equations: RowEquations) -> ColumnLight:
+        """The columns' light by least squares, without the prior that kept the equations regular."""
         shrunk, precision = equations.solve(light - self.black_level), equations.precision
         prior = np.float32(SETTINGS.prior_precision)
         value = shrunk + (shrunk - np.float32(0.5)) * (prior / np.maximum(precision, _FAINT))
