@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -10,23 +11,25 @@ from rxcli.receiver.channel import known_picture
 from rxcli.receiver.channel.known_picture import ColumnLight, PlacedPicture
 from rxcli.receiver.clip.follow import Pose
 from rxcli.receiver.clip.settings import SETTINGS
-from rxcli.receiver.frame.context import FrameContext
 from rxcli.types import BoolArray, Clock, Float32Array, FloatArray, IntArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Observed:
     """Light of a frame."""
 
-    #: The frame, and where it was read; (C, S, R) light of the strips there.
-    context: FrameContext
+    #: Where it was read; (C, S, R) light of the strips there.
     pose: Pose
     light: Float32Array
-    #: The picture as far as it is known before any slot is decided, and the columns' own light by it.
+    #: The picture as far as it is known before any slot is decided.
     picture: PlacedPicture
-    columns: ColumnLight
     #: Whether the picture was found to have changed.
     changed: bool = False
+
+    @cached_property
+    def columns(self) -> ColumnLight:
+        """The columns' own light, by the picture."""
+        return self.picture.solve(self.light)
 
     def header_contrast(self, clock: Clock) -> float:
         """Contrast of the headers on a clock, 1 full, 0 none."""

@@ -133,8 +133,7 @@ class TrackedScreen:
         with timer("sampling"):
             light, picture = self._scaled(self.strips(frame)), _placed(self._picture, pose)
             likely = picture.adapted(light, None, own_clock.rows_per_slot) if self._changes else picture
-            context = replace(last.context, cache=cache, sampled_corners=self.corners)
-            observed = Observed(context, pose, light, likely, likely.solve(light))
+            observed = Observed(pose, light, likely)
         with timer("clock"):
             clock = self._clock(frame, observed, own_clock, timeline.time)
         if clock is None:
@@ -152,7 +151,7 @@ class TrackedScreen:
             clock = measured.clock
             shown = shown_slots(pose.map.inside, known_picture.row_positions(pose.rows, clock), clock)
         view = View(
-            replace(context, sampled_corners=self.corners),
+            replace(last.context, cache=cache, sampled_corners=self.corners),
             replace(last.acquisition, clock=clock),
             clock,
             measured.llr,
@@ -349,7 +348,7 @@ class TrackedScreen:
             view.joint = JointSlots(clock.burst, known_better)
             return
         view.changed |= self._changes
-        observed = Observed(view.context, pose, view.light, picture, picture.solve(view.light), view.changed)
+        observed = Observed(pose, view.light, picture, view.changed)
         if observed.header_contrast(clock) < SETTINGS.min_header:
             return
         measured = self._measured(observed, clock, known, SETTINGS.misfit)
