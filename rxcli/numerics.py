@@ -15,8 +15,8 @@ from rxcli.types import Float32Array, FloatArray
 TINY = 1e-12
 #: Lower limit of likelihoods in single precision, so that their logarithm exists.
 MIN_FLOAT32 = np.finfo(np.float32).tiny
-#: Median of the absolute value of a normal variable of unit variance.
-NORMAL_MEDIAN = 0.6745
+#: Median of the absolute value of a normal variable of unit variance, and its two-sided 95 % quantile.
+NORMAL_MEDIAN, Z95 = 0.6745, 1.959963984540054
 #: Change of a header's slots, lit 1 and dark -1, at its borders.
 _HEADER_STEPS = np.diff(np.concatenate([[0.0], 2.0 * np.array(HEADER) - 1, [0.0]]))
 

@@ -6,8 +6,6 @@ from numpy.typing import ArrayLike
 from rxcli.profiles import LensModel
 from rxcli.types import FloatArray
 
-#: Two-sided 95 % quantile of the normal distribution.
-Z95 = 1.959964
 #: Residual, in standard deviations, from which values weigh less (Huber).
 _HUBER = 1.5
 

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.calibrate.fitting import Z95
 from rxcli.calibrate.periodic import fit_periodic
 from rxcli.calibrate.shutter import Picture, Stripes
 from rxcli.calibrate.waveform import Switched, fit_switched, lamp_wave, light_curve
+from rxcli.numerics import Z95
 from rxcli.types import FloatArray
 
 #: What an exposure may differ from the file's by, and unknown exposures that are tried, periods.

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from rxcli.calibrate.fitting import Z95
+from rxcli.numerics import Z95
 from rxcli.types import BoolArray, FloatArray
 
 #: Oversampling of the spectrum in the search.

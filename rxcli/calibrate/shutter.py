@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from rxcli.calibrate import periodic
 from rxcli.calibrate.exposure import ExposureEstimate, estimate_exposure
-from rxcli.calibrate.fitting import Z95, weighted_mean
+from rxcli.calibrate.fitting import weighted_mean
 from rxcli.calibrate.periodic import FEW_PERIODS, PeriodicFit, fit_fundamental
 from rxcli.calibrate.spots import find_spots
 from rxcli.errors import ReceiverError, UsageError
+from rxcli.numerics import Z95
 from rxcli.profiles import LensModel
 from rxcli.types import BoolArray, FloatArray, IntArray
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rxcli.calibrate.fitting import Z95
 from rxcli.calibrate.periodic import PeriodicFit, harmonic_waves, noise_spectrum
+from rxcli.numerics import Z95
 from rxcli.types import FloatArray
 
 #: Most harmonics; places of the middle of the lit part, in half a period; points of the noise's spectrum.

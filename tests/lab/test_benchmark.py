@@ -449,7 +449,8 @@ def test_mistakes_are_told(arguments: list[str], message: str) -> None:
 
 
 def test_films_twins_and_photographs_stand_in_one_table(tmp_path: Path) -> None:
-    small = ["width_px=[480,480]", "rows=[0.25,0.25]", "n_frames=2", "exposure_slots=[1,1]", 'screens=["paper-8k65"]']
+    small = ["width_px=[240,240]", "rows=[0.25,0.25]", "n_frames=2", "exposure_slots=[1,1]", 'screens=["paper-8k65"]']
+    small += ["named=true"]  # else the screen is searched, in vain
     arguments = ["films", "--only", "pan", "--count", "1", "--seed", "3", "--quiet", "--out", str(tmp_path / "out")]
     arguments += [part for field in small for part in ("--set", field)]
     assert CliRunner().invoke(benchmark, [*arguments, "--save", str(tmp_path / "saved")]).exit_code in (0, None)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.lab.benchmark.cases import Record
+from rxcli.numerics import Z95
 from rxcli.results.truth import Score
 from rxcli.types import FloatArray
 
@@ -25,8 +26,6 @@ ROWS_BOUND, ROWS_WILD = 5e-4, 1e-2
 CORNER_BOUND = 0.003
 #: Minimum number of packets with the true corners for a screen that should be found.
 SHOWN = 5
-#: Two-sided 95 % quantile of the normal distribution.
-Z95 = 1.959963984540054
 N_BINS = 10
 
 

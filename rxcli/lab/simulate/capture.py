@@ -33,8 +33,6 @@ class Capture:
     scene: Scene
     exposure: Exposure
     frame: int
-    #: Presentation time, seconds.
-    time_s: float
     #: (height, width) uint16 mosaic, or (height, width, 3) where the sensor has no filter array.
     raw: NDArray[np.uint16]
     #: Data for the genie-aided bound; None unless requested.
@@ -116,8 +114,7 @@ class Recording:
         recorder = OracleRecorder(exposure) if oracle else None
         seed = int(np.random.SeedSequence([self.seed, frame]).generate_state(1, np.uint64)[0])
         raw = take_picture(exposure, seed, threads, recorder.visit if recorder else None)
-        time_s = frame / self.scene.frame_rate_hz
-        return Capture(self.scene, exposure, frame, time_s, raw, recorder.finish() if recorder else None)
+        return Capture(self.scene, exposure, frame, raw, recorder.finish() if recorder else None)
 
     def pictures(self, bits: int = 8, progress: Callable[..., Any] = iter) -> Iterator[NDArray[Any]]:
         """The developed frames of the scene, mixed over time where its camera does so; see `Capture.developed`."""

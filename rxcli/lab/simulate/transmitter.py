@@ -82,7 +82,6 @@ def dimming_levels(picture: NDArray[Any], rows: int, columns: int) -> NDArray[An
 class Drive:
     """What the screen is driven with for one picture."""
 
-    screen: ScreenProfile
     #: (height_px, width_px, 3) uint8, compensated grey levels.
     grey: NDArray[np.uint8]
     #: (segment rows, columns) average light of each segment, 0..1.
@@ -146,7 +145,7 @@ def drive_screen(
     backlight = backlight_average(levels, screen, picture.shape[0], picture.shape[1], spread_tails)
     needed = _PANEL_LIGHT.astype(np.float32)[picture] / np.maximum(backlight, 1e-6)[..., None].astype(np.float32)
     grey = np.rint(255 * np.clip(needed, 0, 1) ** np.float32(1 / PANEL_GAMMA)).astype(np.uint8)
-    return Drive(screen, grey, levels, choose_weights(weights, levels))
+    return Drive(grey, levels, choose_weights(weights, levels))
 
 
 def backlight_average(levels: FloatArray, screen: ScreenProfile, height: int, width: int, tails: float) -> FloatArray:
