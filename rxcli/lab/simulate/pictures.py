@@ -95,6 +95,7 @@ def _sky(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _bars(u: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Eight bars of colours, white to black, as of a test card; `u` is the place across, 0..1."""
     index = np.minimum((u * 8).astype(np.int64), 7)
     return 0.75 * np.stack([~index & 1, ~(index >> 1) & 1, ~(index >> 2) & 1], axis=-1) + 0.1
 

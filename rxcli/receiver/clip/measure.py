@@ -63,6 +63,7 @@ def measured_by(
     if lit is None:
         lit = known_picture.first_decision(columns, positions, clock)
     fit = known_picture.fit_response(columns, lit, positions, clock.exposure_slots)
+    # Where compression took contrast, noise of the rows is measured by what is expected of this frame.
     if adapts or fit.centre < SETTINGS.faded:
         expected = known_picture.expected_light(lit, positions, clock.exposure_slots, isi_memory, fit)
         if adapts:
