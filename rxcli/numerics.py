@@ -67,6 +67,15 @@ def local_mean(values: Float32Array, window: int) -> Float32Array:
     return np.asarray(cv2.blur(values, (window | 1, 1)))
 
 
+def waves_of(turns: FloatArray) -> NDArray[np.complex64]:
+    """exp(2 pi i `turns`), in single precision after whole turns are taken off."""
+    angle = np.asarray((turns - np.rint(turns)) * (2 * np.pi), np.float32)
+    out = np.empty(angle.shape, np.complex64)
+    np.cos(angle, out=out.real)
+    np.sin(angle, out=out.imag)
+    return out
+
+
 def best_run(gain: FloatArray) -> tuple[int, int]:
     """The part of `gain` (n,) with the largest sum: its first place, and the one after its last."""
     total = np.concatenate([[0.0], np.cumsum(gain)])

@@ -169,7 +169,8 @@ def header_of(data: bytes) -> Header:
 
 def is_row(data: bytes) -> bool:
     """Whether bytes that begin with a JPEG picture are three or more in a row: a clip, no photo with a second view."""
-    return len(_NEXT.findall(data)) > 1 and not any(data.startswith(_LISTED, at) for _, at, _ in segments(data))
+    has_joints = data.count(bytes((0xFF, _END))) > 1 and len(_NEXT.findall(data)) > 1
+    return has_joints and not any(data.startswith(_LISTED, at) for _, at, _ in segments(data))
 
 
 def segments(data: bytes, beyond_scan: bool = False) -> Iterator[tuple[int, int, int]]:

@@ -100,25 +100,33 @@ def propose_slots(stripes: Stripes) -> list[CameraHypothesis]:
     if (width := stripes.half_width) <= 0:
         return []
     coarse, level = stripes.coarse
-    curvatures = tried_bends(coarse) * UNIT_BEND
-    found = [_strongest_line(coarse, level, curvature, width) for curvature in curvatures]
-    best = max(range(len(found)), key=lambda number: found[number][1])
-    if found[best][1] < SETTINGS.min_slot_line:
+
+    def line(curvature: FloatArray) -> tuple[float, float, FloatArray]:
+        rows, strength = _strongest_line(coarse, level, curvature, width)
+        return strength, rows, curvature
+
+    lines = [line(np.zeros(4))]
+    if coarse.may_bend:
+        bends = tried_bends(coarse) * UNIT_BEND
+        # Neighbouring columns show about the bend.
+        near = np.abs(bends - likeliest_bend(coarse, level)).max(axis=1).argsort()[:3]
+        lines.append(max(map(line, bends[near]), key=lambda found: found[0]))
+    lines.sort(key=lambda found: -found[0])
+    if lines[0][0] < SETTINGS.min_slot_line:
         return []
     return [
         CameraHypothesis(
             rows_per_slot=rows,
             packet_slots=0,
             reversed=is_reversed,
-            curvature=curvatures[place],
+            curvature=curvature,
             exposure_slots=min(exposure_of(width / rows, rows), LONG_EXPOSURE_SLOTS),
             score=strength,
             rows_per_slot_sd=rows * rows / (4 * level.shape[1] * coarse.pitch),
-            curvature_sd=np.abs(curvatures[place]) / 4,
+            curvature_sd=np.abs(curvature) / 4,
             number=number,
         )
-        for number, place in enumerate(dict.fromkeys((best, len(found) // 2)))
-        for rows, strength in (found[place],)
+        for number, (strength, rows, curvature) in enumerate(lines)
         for is_reversed in (False, True)
     ]
 

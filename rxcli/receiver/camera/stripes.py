@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.numerics import TINY, local_mean, peak_offset
+from rxcli.numerics import TINY, local_mean, peak_offset, waves_of
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver.camera.curvature import LENS_PRECISION, UNIT_BEND, curvature_terms, tried_bends
 from rxcli.receiver.camera.settings import SETTINGS
@@ -264,10 +264,13 @@ class _Phases:
 
         Less what the bend costs before the picture is seen.
         """
-        wave = np.exp(-2j * np.pi * (self.middle + np.tensordot(bends, self.terms, 1)) / rows)
-        nearby = np.exp(-2j * np.pi * self.middle[:, None] * off / rows)
-        score = sum(np.abs((wave**order * block).sum(axis=1) @ nearby**order) ** 2 for order, block in self.blocks)
-        return np.asarray(score - np.einsum("bi,ij,bj->b", bends, LENS_PRECISION, bends)[:, None] / 2)
+        places = self.middle + np.tensordot(bends, self.terms, 1), np.outer(self.middle, off)
+        waves = {order: [waves_of(place * -order / rows) for place in places] for order in (1, 2)}
+        blocks = ((*waves[order], block.astype(np.complex64)) for order, block in self.blocks)
+        sums = ((bent * block).sum(axis=1) @ nearby for bent, nearby, block in blocks)
+        power = sum(np.square(each.view(np.float32)) for each in sums)
+        cost = np.einsum("bi,ij,bj->b", bends, LENS_PRECISION, bends)[:, None] / 2
+        return np.asarray(power[:, ::2] + power[:, 1::2] - cost)
 
     def refined(self, rate: float, curvature: FloatArray, *, may_bend: bool) -> tuple[float, FloatArray]:
         """Rate, slots a row, and bend (4,) by Newton's method; the bend is kept unless it `may_bend`."""
@@ -280,7 +283,7 @@ class _Phases:
             normal, pull = prior[free, free].copy(), -(prior @ values)[free]
             for order, block in self.blocks:
                 turned = (block * np.exp(-2j * np.pi * order * place * values[0])).ravel()
-                turned = turned * (2 * order * turned.sum().conj())
+                turned *= 2 * order * turned.sum().conj()
                 around = slopes - (slopes @ turned.real / turned.real.sum())[:, None]
                 normal += order * (around * np.maximum(turned.real, 0)) @ around.T
                 pull += around @ turned.imag

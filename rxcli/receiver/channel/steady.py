@@ -20,24 +20,31 @@ def without_steady_light(profiles: RowProfiles, clock: Clock) -> RowProfiles:
     """
     import cv2
 
-    shape, at = profiles.light.shape, profiles.rows if profiles.sensor_row is None else profiles.sensor_row
-    slot = np.broadcast_to((at - clock.row0) / clock.rows_per_slot + clock.first_slot, shape)
-    is_dark = sees_dark_header(slot % clock.packet_slots, clock.exposure_slots + _SMOOTH) & profiles.inside
-    if clock.exposure_slots > _MAX_EXPOSURE or not is_dark.any():
+    if clock.exposure_slots > _MAX_EXPOSURE:
         return profiles
-    black = np.float32(np.percentile(profiles.light[is_dark], 25))
-    light, inside = profiles.light.reshape(-1, shape[2]), profiles.inside.reshape(-1, shape[2])
-    is_dark = is_dark.reshape(light.shape)
-    window = round(_DARK_WITHIN * clock.rows_per_slot) | 1
-    smooth = local_mean(light - black, max(round(_SMOOTH * clock.rows_per_slot), 1))
+    shape, rows = profiles.light.shape, max(round(_SMOOTH * clock.rows_per_slot), 1)
+    n = shape[2] // rows
+    at = profiles.rows if profiles.sensor_row is None else profiles.sensor_row
+    top, bottom = (np.s_[..., start : n * rows : rows] for start in (0, rows - 1))
+    slot = ((at[top] + at[bottom]) / 2 - clock.row0) / clock.rows_per_slot + clock.first_slot
+    inside = profiles.inside[top] & profiles.inside[bottom]
+    is_dark = sees_dark_header(slot % clock.packet_slots, clock.exposure_slots + _SMOOTH) & inside
+    if not is_dark.any():
+        return profiles
+    inside, is_dark = inside.reshape(-1, n), is_dark.reshape(-1, n)
+    light = profiles.light.reshape(-1, shape[2])[:, : n * rows]
+    light = np.asarray(cv2.resize(light, (n, len(light)), interpolation=cv2.INTER_AREA), np.float32)
+    black, window = np.float32(np.percentile(light[is_dark], 25)), round(_DARK_WITHIN * clock.rows_per_slot / rows) | 1
     # Of each strip, the light in the dark slots of the last header, and of the next one.
-    row = np.arange(shape[2])
-    before, after = np.where(is_dark, row, -1), np.where(is_dark, row, shape[2])
-    before = np.maximum.accumulate(before, axis=1)
-    after = np.minimum.accumulate(after[:, ::-1], axis=1)[:, ::-1]
-    padded = np.pad(smooth, ((0, 0), (0, 1)))
+    part = np.arange(n)
+    before = np.maximum.accumulate(np.where(is_dark, part, -1), axis=1)
+    after = np.minimum.accumulate(np.where(is_dark, part, n)[:, ::-1], axis=1)[:, ::-1]
+    padded = np.pad(light - black, ((0, 0), (0, 1)))
     shown = np.maximum(*(np.take_along_axis(padded, place, axis=1) for place in (before, after)))
-    least = cv2.erode(np.where(inside, smooth, np.float32(1)), np.ones((1, window), np.uint8))
+    least = cv2.erode(np.where(inside, light - black, np.float32(1)), np.ones((1, window), np.uint8))
     steady = np.minimum(np.maximum(shown, 0), local_mean(least, window))
     steady *= inside * (steady > _MIN_SHARE * local_mean(light, window))
-    return replace(profiles, light=profiles.light - steady.reshape(shape))
+    if not steady.any():
+        return profiles
+    whole = np.pad(np.repeat(steady, rows, axis=1), ((0, 0), (0, shape[2] - n * rows)), mode="edge")
+    return replace(profiles, light=profiles.light - whole.reshape(shape) * profiles.inside)

@@ -10,9 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from rxcli.numerics import TINY
+from rxcli.numerics import TINY, waves_of
 from rxcli.receiver.screen.grid import Grid, grid_through
 from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import Float32Array, FloatArray
@@ -116,14 +115,14 @@ def _best_combs(rest: Float32Array, x: FloatArray, y: FloatArray, pitches: Float
     n_frequencies = int(np.ceil((largest + reach) / spacing)) - start + 1
     own = pitches[:, None, None] * (1 + along[:, None] * y)
     nearest = np.round(own / spacing).astype(np.int64) - start
-    bent = rest * _turned(float(pitches.mean()) * np.multiply.outer(across, x * x))
+    bent = rest * waves_of(float(pitches.mean()) * np.multiply.outer(across, x * x))
     frequencies = (start + np.arange(n_frequencies)) * spacing
     if is_upright:
-        along_strips = np.matmul(bent, _turned(np.outer(x[0], frequencies)))
+        along_strips = np.matmul(bent, waves_of(np.outer(x[0], frequencies)))
     else:
-        waves = _turned(np.multiply.outer(x, frequencies))
+        waves = waves_of(np.multiply.outer(x, frequencies))
         along_strips = np.matmul(bent.transpose(1, 0, 2), waves).transpose(1, 0, 2)
-    over_windows = _turned(pitches[:, None, None] * np.multiply.outer(y, turns))
+    over_windows = waves_of(pitches[:, None, None] * np.multiply.outer(y, turns))
     out = []
     for number, pitch in enumerate(pitches.tolist()):  # together they would take gigabytes in tall pictures
         sums = np.matmul(along_strips[:, np.arange(y.size), nearest[number]], over_windows[number])
@@ -133,9 +132,3 @@ def _best_combs(rest: Float32Array, x: FloatArray, y: FloatArray, pitches: Float
         shape = float(turns[k]), float(across[i]), float(along[j])
         out.append(Comb(float(np.sqrt(power[i, j, k])), pitch, *shape, phase))
     return out
-
-
-def _turned(turns: FloatArray) -> NDArray[np.complex64]:
-    """exp(2 pi i `turns`), in single precision after whole turns are taken off."""
-    angle = np.asarray((turns - np.rint(turns)) * (2 * np.pi), np.float32)
-    return np.asarray(np.cos(angle) + np.complex64(1j) * np.sin(angle), np.complex64)

@@ -8,11 +8,11 @@ borders are there, and how they lean. One course through all parts is where thei
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rxcli.numerics import TINY
 from rxcli.receiver.screen.strips import Course, PictureStrips
-from rxcli.types import Float32Array, FloatArray
+from rxcli.types import BoolArray, Float32Array, FloatArray
 
 #: Parts of a window of rows, in which columns hardly lean; parts of the picture across and down, and standard deviation
 #: of a part's Gaussian weight, in widths of a part.
@@ -44,10 +44,18 @@ def tilted_course(strips: PictureStrips) -> Course | None:
         down = pitch * (turn + (turn * g - h) * x) / below
         score += spectrum[_nearest(across, _ACROSS), _nearest(down, _DOWN)]
     best = np.unravel_index(int(score.argmax()), score.shape)
-    is_upright = (np.abs(turn) < _UPRIGHT_TURN) & (np.hypot(g, h) < _UPRIGHT_PERSPECTIVE)
-    if score[best] < max(_MIN_SCORE, float(score[:, is_upright].max()) + _LEAD):
+    if score[best] < max(_MIN_SCORE, float(score[:, _is_upright(turn, g, h)].max()) + _LEAD):
         return None
     return Course(*(float(np.broadcast_to(values, score.shape)[best]) for values in (turn, g, h)))
+
+
+def is_upright(course: Course) -> bool:
+    """Whether upright strips show columns of this course."""
+    return bool(_is_upright(course.turn, course.g, course.h))
+
+
+def _is_upright(turn: ArrayLike, g: ArrayLike, h: ArrayLike) -> BoolArray:
+    return np.asarray((np.abs(turn) < _UPRIGHT_TURN) & (np.hypot(g, h) < _UPRIGHT_PERSPECTIVE))
 
 
 def _nearest(values: FloatArray, places: FloatArray) -> NDArray[np.intp]:

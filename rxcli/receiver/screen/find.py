@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.combs import find_combs, grid_of_comb
-from rxcli.receiver.screen.courses import tilted_course
+from rxcli.receiver.screen.combs import Comb, find_combs, grid_of_comb
+from rxcli.receiver.screen.courses import is_upright, tilted_course
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_through
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
 from rxcli.receiver.screen.outline import Outline
@@ -34,9 +34,9 @@ _REACH_GAIN = 1.4
 #: Steps of a grid on some of the windows, and last steps on all windows; times that the course of columns which lean is
 #: followed.
 _FIRST_STEPS, _LAST_STEPS, _COURSES = 3, 2, 2
-#: Contrast of the strongest comb, as a share of the light it explains, from which no further combs are tried; number of
+#: Contrast of the strongest comb's grid, as a share of the light it explains, from which no others are tried; number of
 #: combs that are fitted otherwise.
-_PLAIN_CONTRAST, _N_FITTED = 0.22, 2
+_PLAIN_CONTRAST, _N_FITTED = 0.15, 2
 #: Weights of the light that a grid explains and of its perspective in its score, against 1 for its contrast: fitted to
 #: the grids of 186 simulated scenes, one in four of a night, such that no bright one loses its own.
 _BY_EXPLAINED, _BY_PERSPECTIVE = 7.0, -1.0
@@ -187,27 +187,28 @@ def wide_grid(
         along: reads the strips of the picture along columns that lean; None if only upright ones are sought.
     """
     quiet = strips.without_common_light()
-    starts = _starts(strips, quiet, sigma)
-    is_plain = bool(starts) and starts[0][1].contrast >= _PLAIN_CONTRAST * starts[0][1].explained
-    if is_plain:
-        starts = starts[:1]
-    else:
-        course = along and tilted_course(quiet)
+    combs = find_combs(quiet)
+    placed = [_fitted(strips, grid_of_comb(comb, strips), sigma, along) for comb in combs[:1]]
+    if not (placed and _is_plain(placed[0][1])):
+        starts, course = _starts(strips, combs[1:], sigma), along and tilted_course(quiet)
         if along and course:
             starts += _leaning_starts(along, course, sigma)
-    placed = [_fitted(own, grid, sigma, along) for own, grid in starts]
+        placed += [_fitted(own, grid, sigma, along) for own, grid in starts]
     return max((own for own in placed if _stands_out(*own, least)), key=lambda own: _score(own[1]), default=None)
 
 
-def _starts(strips: PictureStrips, quiet: PictureStrips, sigma: float) -> list[_Placed]:
-    """Grids of the strongest combs, the strongest first if it is plain, else the likeliest."""
-    some, combs = _half(strips), find_combs(quiet)
-    starts = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[:1]]
-    if not starts or starts[0].contrast < _PLAIN_CONTRAST * starts[0].explained:
-        starts += [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs[1:]]
-        # Contrast needs borders that are in their place already.
-        starts = sorted(starts, key=lambda grid: -grid.explained - grid.contrast)[:_N_FITTED]
-    return [(strips, grid) for grid in starts]
+def _is_plain(grid: Grid) -> bool:
+    """Whether no other grid can be right."""
+    return grid.contrast >= _PLAIN_CONTRAST * grid.explained and is_upright(grid.course)
+
+
+def _starts(strips: PictureStrips, combs: Sequence[Comb], sigma: float) -> list[_Placed]:
+    """Grids of the likeliest combs, from every fourth window."""
+    some = strips.blocks(slice(None, None, 4))
+    # Contrast needs borders that are in their place already.
+    grids = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs]
+    likeliest = sorted(grids, key=lambda grid: -grid.explained - grid.contrast)[:_N_FITTED]
+    return [(strips, grid) for grid in likeliest]
 
 
 def _leaning_starts(along: Callable[[Course], PictureStrips], course: Course, sigma: float) -> list[_Placed]:
@@ -215,7 +216,7 @@ def _leaning_starts(along: Callable[[Course], PictureStrips], course: Course, si
     found: list[_Placed] = []
     for _ in range(_COURSES):
         strips = along(course)
-        for _, start in _starts(strips, strips.without_common_light(), sigma):
+        for _, start in _starts(strips, find_combs(strips.without_common_light()), sigma):
             grid = moved_by_waveforms(_half(strips), start, sigma, _FIRST_STEPS)
             found.append((strips, with_light(_half(strips), grid, sigma)))
         found = sorted(found, key=lambda own: -_score(own[1]))[:_N_FITTED]

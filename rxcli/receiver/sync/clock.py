@@ -59,15 +59,14 @@ def resample(
     widths = np.diff(positions, axis=-1)
     valid = (positions[:, :-1] >= start[:, None]) & (positions[:, 1:] <= stop[:, None]) & (widths > TINY)
     mean = _integrate(light, positions)
-    mean /= np.maximum(widths, TINY)
-    mean *= valid
+    mean *= valid / np.maximum(widths, TINY)
     shape = (*profiles.light.shape[:2], n_samples)
     return mean.astype(np.float32).reshape(shape), valid.astype(np.float32).reshape(shape)
 
 
 def _bounded(light: Float32Array) -> Float32Array:
     """Replace NaN and impossible light by 0, since one NaN would spoil every sum after it."""
-    if float(np.abs(light).max(initial=0.0)) <= SETTINGS.max_light:
+    if -SETTINGS.max_light <= light.min(initial=0.0) and light.max(initial=0.0) <= SETTINGS.max_light:
         return light
     return np.where(np.abs(light) <= SETTINGS.max_light, light, np.float32(0))
 
@@ -97,9 +96,14 @@ def _integrate(values: Float32Array, positions: FloatArray) -> FloatArray:
     """Integral of piecewise constant `values` (n, R) between neighbouring `positions`; (n, positions - 1) float64."""
     total = np.zeros((len(values), values.shape[1] + 1))
     np.cumsum(values, axis=1, dtype=np.float64, out=total[:, 1:])
-    borders = np.arange(total.shape[1], dtype=np.float64)
-    places = np.broadcast_to(positions, (len(values), positions.shape[1]))
-    return np.diff([np.interp(at, borders, row) for at, row in zip(places, total, strict=True)], axis=1)
+    whole = np.minimum(positions.astype(np.intp), values.shape[1] - 1)
+    part = positions - whole
+    if len(whole) == 1:
+        return np.diff(total.take(whole[0], axis=1) + part * values.take(whole[0], axis=1), axis=1)
+    row = np.arange(len(values))[:, None]
+    at_borders = total.take(whole + row * total.shape[1])
+    at_borders += part * values.take(whole + row * values.shape[1])
+    return np.diff(at_borders, axis=1)
 
 
 def contrast(
