@@ -14,9 +14,9 @@ class ColourSettings(msgspec.Struct, frozen=True):
     plain_dark: float = 0.02
     #: Shares of the stripes and of the rows of a picture in which a contrast of red from `plainly` on shows that it
     #: blinks.
-    enough_stripes: float = 0.15
-    enough_rows: float = 0.15
-    plainly: float = 0.6
+    enough_stripes: float = 0.2
+    enough_rows: float = 0.2
+    plainly: float = 0.75
     #: Red blinks or not, with a contrast of 1 or 0, whichever is nearer; standard errors that exclude the further one.
     middle: float = 0.5
     sure: float = 3.0
