@@ -41,7 +41,7 @@ class EstimateSettings(msgspec.Struct, frozen=True):
     #: Clocks this close, relative, are one; hypotheses that are proposed; and the score that further ones need, as most
     #: of noise have 30 to 45, and right ones 60 and more where a whole packet is in view.
     same_clock: float = 4e-3
-    n_proposed: int = 5
+    n_proposed: int = 3
     min_score: float = 40.0
     #: The same of long exposures, whose passes are costly: photographs without a screen reach 40 to 76, mostly, and
     #: right ones with packets 77 and more.
