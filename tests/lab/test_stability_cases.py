@@ -276,4 +276,4 @@ def test_scenes_that_led_the_pose_astray(seed: int) -> None:
     scene = replace(scene, light_e_per_s=light, room=room, column_delay_slots=late, exposure_s=1 / 32000)
     scene = replace(scene, sensor=replace(scene.sensor, **levels), slot_rate_error_ppm=error, blur_px=blur_px)
     trial = simulate_trial(scene, seed)
-    assert received(trial.frame, trial.options(known_outline=False)).status in ("no_screen", "no_signal")
+    assert received(trial.frame, trial.options(corners=None)).status in ("no_screen", "no_signal")

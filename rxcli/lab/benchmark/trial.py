@@ -51,15 +51,9 @@ class Trial:
         """What was sent."""
         return msgspec.convert(self.capture.truth, Truth, str_keys=True)
 
-    def options(self, *, known_outline: bool = True, **more: Any) -> ReceiverOptions:
-        """Options of the receiver that name the screen and the camera.
-
-        Args:
-            known_outline: hand over the true corners; otherwise the receiver looks for the screen.
-            more: further fields of `ReceiverOptions`.
-        """
-        known = known_options(self.capture.exposure)
-        return replace(known, corners=known.corners if known_outline else None, **more)
+    def options(self, **more: Any) -> ReceiverOptions:
+        """Options of the receiver that name screen, camera and corners; `more` are further fields."""
+        return replace(known_options(self.capture.exposure), **more)
 
 
 def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False) -> Trial:

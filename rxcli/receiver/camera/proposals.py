@@ -9,6 +9,7 @@ similarity of neighbouring columns; `fit` estimates it from the decoded slots.
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Self
 
 import numpy as np
 
@@ -189,11 +190,10 @@ def _clocks(stripes: Stripes, curvature: FloatArray, exposures: dict[int, float]
     lines = FINE * n_rows / (low + peaks(line[low : high + 2], SETTINGS.n_peaks, 2 * FINE))
     # Light exposed for about a slot has a stronger line at twice the rate.
     harmonics = FINE * np.array([1, 2])
-    copies = _surprise(autocorrelation(_from_their_tops(columns)), round(2 * SLOTS_PER_SYMBOL * shortest))
-    total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
-    for length, exposure in exposures.items():
+    repeats = _Repeats.of(columns, shortest, curvature, pitch)
+    for length, stated in exposures.items():
         low, high = (int(rows * length) for rows in (shortest, longest))
-        lags = low + peaks(copies[low : high + 1], SETTINGS.n_peaks, max(round(2 * shortest), 1))
+        lags = low + peaks(repeats.copies[low : high + 1], SETTINGS.n_peaks, max(round(2 * shortest), 1))
         for rows in np.concatenate([lines, lags / length]).tolist():
             # Of the shortest packets a picture may show less than a payload, but more than a preamble.
             least = length - PREAMBLE_SLOTS
@@ -202,8 +202,7 @@ def _clocks(stripes: Stripes, curvature: FloatArray, exposures: dict[int, float]
                 continue
             strength = float(np.interp(harmonics * n_rows / rows, np.arange(line.size), line).max())
             found = min(exposure_of(light_width / rows, rows * pitch), LONG_EXPOSURE_SLOTS)
-            clock = _Clock(rows, length, strength, exposure, found)
-            yield from _both_ways(clock, copies, total, curvature, pitch)
+            yield from repeats.cameras(rows, length, strength, stated, found)
 
 
 def _smeared_clocks(stripes: Stripes, exposures: dict[int, float]) -> Iterator[CameraHypothesis]:
@@ -224,56 +223,58 @@ def _smeared_clocks(stripes: Stripes, exposures: dict[int, float]) -> Iterator[C
                 return
             continue
         columns = columns_of(straightened(strips, change, curvature), strips.n_columns)
-        copies = _surprise(autocorrelation(_from_their_tops(columns)), round(2 * SLOTS_PER_SYMBOL * rows))
-        total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
-        for length, exposure in exposures.items():
+        repeats = _Repeats.of(columns, rows, curvature, strips.pitch)
+        for length, stated in exposures.items():
             if rows * (length - PREAMBLE_SLOTS) <= columns.shape[1]:
-                clock = _Clock(rows, length, strength, exposure, found)
-                yield from _both_ways(clock, copies, total, curvature, strips.pitch)
+                yield from repeats.cameras(rows, length, strength, stated, found)
 
 
 @dataclass(frozen=True, slots=True)
-class _Clock:
-    """Rows a slot and length of packets that may be those of a picture."""
+class _Repeats:
+    """What the columns of stripes of one bend show of copies and headers."""
 
-    rows: float
-    length: int
-    #: How far the line of the slots stands out, log-likelihood.
-    strength: float
-    #: Exposure that the file states, 0 where it does not, and that the light shows, slots.
-    stated: float
-    found: float
+    #: (R,) excess of the columns' autocorrelation, and (R + 1,) running sum of their mean.
+    copies: FloatArray
+    total: FloatArray
+    #: (4,) bend of the stripes, and picture rows of a row.
+    curvature: FloatArray
+    pitch: float
 
+    @classmethod
+    def of(cls, columns: Float32Array, shortest: float, curvature: FloatArray, pitch: float) -> Self:
+        """From columns (C, R) whose slots have `shortest` rows and more."""
+        copies = _surprise(autocorrelation(_from_their_tops(columns)), round(2 * SLOTS_PER_SYMBOL * shortest))
+        total = np.concatenate([[0.0], np.cumsum(columns.mean(axis=0, dtype=np.float64))])
+        return cls(copies, total, curvature, pitch)
 
-def _both_ways(
-    clock: _Clock, copies: FloatArray, total: FloatArray, curvature: FloatArray, pitch: float
-) -> Iterator[CameraHypothesis]:
-    """Cameras with a clock, as the rows stand and read backwards.
+    def cameras(
+        self, rows: float, length: int, strength: float, stated: float, found: float
+    ) -> Iterator[CameraHypothesis]:
+        """Cameras that may have taken the picture, as its rows stand and read backwards.
 
-    Args:
-        clock: the clock.
-        copies: (R,) excess of the columns' autocorrelation.
-        total: (R + 1,) running sum of the columns' mean.
-        curvature: (4,) of the stripes.
-        pitch: picture rows of a row.
-    """
-    rows, length = clock.rows, clock.length
-    common = float(np.interp(rows * length, np.arange(copies.size), copies, right=0.0)) ** 2
-    common += 2 * min(clock.strength, SETTINGS.max_line)
-    off_slots = SETTINGS.period_error[clock.found > LONG_EXPOSURE_SLOTS]
-    for is_reversed, header in enumerate(_header_peaks(total, rows, length)):
-        yield CameraHypothesis(
-            rows_per_slot=rows * pitch,
-            packet_slots=length,
-            reversed=bool(is_reversed),
-            curvature=curvature,
-            exposure_slots=clock.stated or clock.found,
-            score=max(header, 0.0) ** 2 + common,
-            # A period that is off by a part of a slot over the picture shows as well.
-            rows_per_slot_sd=rows * rows * pitch * off_slots / copies.size,
-            curvature_sd=np.abs(curvature) / 4,
-            stated_exposure_slots=clock.stated,
-        )
+        Args:
+            rows: of a slot.
+            length: of a packet, slots.
+            strength: how far the line of the slots stands out, log-likelihood.
+            stated: exposure that the file states, slots, 0 where it does not.
+            found: exposure that the light shows.
+        """
+        common = float(np.interp(rows * length, np.arange(self.copies.size), self.copies, right=0.0)) ** 2
+        common += 2 * min(strength, SETTINGS.max_line)
+        off_slots = SETTINGS.period_error[found > LONG_EXPOSURE_SLOTS]
+        for is_reversed, header in enumerate(_header_peaks(self.total, rows, length)):
+            yield CameraHypothesis(
+                rows_per_slot=rows * self.pitch,
+                packet_slots=length,
+                reversed=bool(is_reversed),
+                curvature=self.curvature,
+                exposure_slots=stated or found,
+                score=max(header, 0.0) ** 2 + common,
+                # A period that is off by a part of a slot over the picture shows as well.
+                rows_per_slot_sd=rows * rows * self.pitch * off_slots / self.copies.size,
+                curvature_sd=np.abs(self.curvature) / 4,
+                stated_exposure_slots=stated,
+            )
 
 
 def exposure_by_changes(columns: Float32Array, rows_per_slot: float) -> float:
