@@ -48,9 +48,8 @@ class Acquisition:
         profiles, n_columns = self.profiles, self.screen.columns
         n, start = min(n_columns - 2 * (n_columns // 4), _MAX_BRIGHT), min(n_columns // 4, 1)
         n_inside = np.maximum(profiles.inside.sum(axis=(1, 2)), 1)
-        light = np.append(0.0, np.cumsum((profiles.light * profiles.inside).sum(axis=(1, 2)) / n_inside))
-        light = light[start : n_columns - start + 1]
-        return start + int((light[n:] - light[:-n]).argmax()) + np.arange(n)
+        light = ((profiles.light * profiles.inside).sum(axis=(1, 2)) / n_inside)[start : n_columns - start]
+        return start + int(np.convolve(light, np.ones(n), "valid").argmax()) + np.arange(n)
 
     def of_columns(self, part: IntArray | slice) -> Acquisition:
         """The acquisition of some columns."""
