@@ -15,7 +15,7 @@ from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, WEIGHTS
 from rxcli.receiver import channel
 from rxcli.receiver.channel import denoise, ratios
 from rxcli.receiver.decode import assemble, detect, survivors
-from rxcli.receiver.decode.settings import FINE_SURVIVORS, QUICK_SURVIVORS
+from rxcli.receiver.decode.settings import QUICK_SURVIVORS
 from rxcli.receiver.decode.settings import SURVIVORS as survivor_settings
 from rxcli.receiver.frame.acquisition import Acquisition, noise_of
 from rxcli.receiver.frame.passes import Reception, dark_columns, packet_llr
@@ -272,29 +272,28 @@ def _joint_snr(
     mean = mean_of_valid(light, samples.valid, SLOTS_PER_SYMBOL * q)
     contrast = 2 * np.maximum(mean, 0) * model.crosstalk.own / np.float32(max(clock.exposure_slots, 1.0))
     ratio = contrast**2 / model.noise.variance(mean) * samples.valid
-    return np.asarray(ratio[..., q // 2 :: q].sum(axis=1) * np.float32(survivor_settings.information))
+    return np.asarray(ratio[..., q // 2 :: q].sum(axis=1) * np.float32(survivor_settings.information_of(q)))
 
 
 def follow_picture(
     acquisition: Acquisition, reception: Reception, columns: NDArray[np.int64], *, keeps_weights: bool = False
 ) -> Reception:
     """Detect slots and picture of some columns jointly, with all strips, given the slots decided so far."""
-    clock, q, settings = reception.clock, STILL.coarse_samples, survivor_settings
-    if reception.is_long:
-        reception = _refined(acquisition, reception, columns)
-        clock, q, settings = reception.clock, denoise.SAMPLES_PER_SLOT, FINE_SURVIVORS
+    reception = _refined(acquisition, reception, columns) if reception.is_long else reception
+    clock = reception.clock
+    q = int(np.clip(clock.rows_per_slot / STILL.min_sample_rows, STILL.coarse_samples, denoise.SAMPLES_PER_SLOT))
     samples, model = _view(acquisition, reception, np.arange(len(reception.snr)), q, ratios.by_start(clock))
     lit = clock.on_grid(reception.posteriors.lit)
     if acquisition.profiles.has_row_noise and not reception.is_long:
         by_start = replace(model, exposure=Exposure.by_start(clock.exposure_slots, q))
         whole = by_start.expected(lit, clock, np.arange(len(lit))).whole
         samples = denoise.remove_row_noise(samples, whole, model)
-    if reception.is_long:  # A local mean would follow the slots.
-        samples = replace(samples, level=mean_of_valid(samples.light, samples.valid, samples.light.shape[2]))
+    # A local mean would follow the slots.
+    samples = replace(samples, level=mean_of_valid(samples.light, samples.valid, samples.light.shape[2]))
     bursts = ratios.burst_samples(samples, clock, model, columns, lit)
     bursts = _with_weights(bursts, reception.posteriors.w_log_prob[columns], are_known=keeps_weights)
     # Of long exposures columns are too rarely right to show what they have in common.
-    found = survivors.detect(bursts, settings, has_common_weights=not reception.is_long)
+    found = survivors.detect(bursts, has_common_weights=not reception.is_long)
     header_llr, log_prob = reception.posteriors.header_llr[:, columns], found.log_prob
     log_evidence = reception.posteriors.log_evidence[columns]
     if reception.is_long:  # Where arbitrary slots explain a column as well, it may have no packets.

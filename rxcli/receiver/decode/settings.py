@@ -49,8 +49,10 @@ class SurvivorSettings(msgspec.Struct, frozen=True):
 
     #: Most paths that are kept.
     max_paths: int = 48
-    #: Effective number of independent samples per slot and strip.
-    information: float = 0.5
+    #: Effective number of independent samples per slot and strip, whose errors are correlated: of a slot, and more for
+    #: each of its samples.
+    information: float = 0.3
+    sample_information: float = 0.1
     #: Change of the picture per slot, its deviation at the start, both relative; degrees of freedom of its errors.
     drift_per_slot: float = 0.06
     first_deviation: float = 0.3
@@ -59,7 +61,9 @@ class SurvivorSettings(msgspec.Struct, frozen=True):
     max_variance: float = 4.0
     max_picture: float = 1e3
 
+    def information_of(self, samples_per_slot: int) -> float:
+        """Effective number of independent samples per slot and strip."""
+        return self.information + self.sample_information * samples_per_slot
+
 
 SETTINGS, SURVIVORS, QUICK_SURVIVORS = DecodeSettings(), SurvivorSettings(), SurvivorSettings(max_paths=12)
-#: Of four samples per slot, whose errors are correlated more than those of two.
-FINE_SURVIVORS = SurvivorSettings(information=0.7)

@@ -230,6 +230,7 @@ def _forward(samples: BurstSamples, settings: SurvivorSettings, kinds: tuple[boo
         kinds: for each kind of lanes, whether its slots are arbitrary; each has the lanes of `samples`.
     """
     n_slots, q, n_lanes = samples.light.shape[:3]
+    information = settings.information_of(q)
     lanes, (light_of, reach) = np.arange(len(kinds) * n_lanes), _light_of(samples)
     drift, precision = np.float32(settings.drift_per_slot**2 / q), samples.valid / samples.noise
     packed = np.stack([samples.light, precision, samples.neighbours], axis=2)
@@ -256,7 +257,7 @@ def _forward(samples: BurstSamples, settings: SurvivorSettings, kinds: tuple[boo
             for each in np.flatnonzero(in_view[n - reach]).tolist():
                 own, observed = samples.own * light[each][:, None], packed[n - reach, each].take(sample_lane, axis=1)
                 gain = _follow(branches, own, observed, drift, settings)
-                branches.log_likelihood += settings.information / (2 * q) * gain
+                branches.log_likelihood += information / (2 * q) * gain
         # Words that differ so far differ still with a slot more.
         n_recent = np.maximum(n_counting[n], (place + 1) * is_word[symbol])
         paths, target, share = _merged(branches, lanes, (1 << n_recent) - 1, settings.max_paths)
@@ -264,7 +265,7 @@ def _forward(samples: BurstSamples, settings: SurvivorSettings, kinds: tuple[boo
         if PREAMBLE_SLOTS <= n < n_slots and place == SLOTS_PER_SYMBOL - 1:
             ends[n] = paths
     of_noise = np.log(precision, out=np.zeros_like(precision), where=precision > 0).sum((0, 1, 3), np.float64) / (2 * q)
-    of_noise = np.tile(settings.information * (samples.log_scale + of_noise), len(kinds))
+    of_noise = np.tile(information * (samples.log_scale + of_noise), len(kinds))
     return _Passed(paths, steps, ends, _log_totals(paths, lanes) + of_noise, is_word)
 
 

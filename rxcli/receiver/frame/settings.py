@@ -20,6 +20,8 @@ class StillSettings(msgspec.Struct, frozen=True):
 
     #: Samples per slot of the first passes.
     coarse_samples: int = 2
+    #: Fewest rows of a sample of later ones: a mosaic repeats after two.
+    min_sample_rows: float = 2.0
     #: Fewest rows per slot of a joint detection.
     min_joint_rows: float = 2.0
     #: Black level where no header is in view: contrast up to which light is dark, -1 dark to 1 lit; and the percentile

@@ -215,8 +215,8 @@ def test_shipped_models_contradict_wrong_beliefs(name: str) -> None:
     assert towards[wrong].mean() > towards[~wrong].mean() + 0.5
 
 
-#: The first validation frames of four scene classes with doubtful columns.
-DOUBTFUL_FRAMES = (3, 4, 19, 36)
+#: Validation frames of four scene classes with doubtful columns; of class 0 the first with more than a nat to lose.
+DOUBTFUL_FRAMES = (3, 4, 19, 42)
 
 
 def cross_entropy(sample: Sample, corrections: np.ndarray) -> float:

@@ -114,7 +114,7 @@ def path_log_likelihood(burst: BurstSamples, slots: NDArray[np.int64]) -> float:
             gain = a * variance / (a * a * variance + noise)
             picture = np.clip(picture + gain * error, 1 / settings.max_picture, settings.max_picture)
             variance = np.maximum(variance * (1 - gain * a), 0)
-    return settings.information / Q * total
+    return settings.information_of(Q) / Q * total
 
 
 @pytest.mark.parametrize("exposure_slots", [1.0, 2.5])
