@@ -224,7 +224,7 @@ def _with_cut_packets(cache: FrameCache, received: Received, options: ReceiverOp
     screens = proposed_screens(cache, options)
     if isinstance(screens, Failure):
         return own
-    families = list({outline.family: outline for outline in reversed(screens[0])}.values())
+    families = list({own.family: own for own in reversed(screens[0]) if not own.rival_odds}.values())
     context = FrameContext(cache, screens[0][0].corners, known or UNKNOWN, _of_columns(result, options))
     cut = cut_packets(context, families)
     likeliest, *less_likely = (*cut, *([own] if own else ())) or (None,)

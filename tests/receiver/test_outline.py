@@ -103,12 +103,12 @@ def test_packets_tell_between_families() -> None:
     own = numbered(candidates[0], candidates, {0: 60.0, 1: 20.0}.get)
     assert own.certainty == pytest.approx(0.5, abs=1e-9)
     rival = numbered(candidates[0], candidates, {0: 60.0, 1: 58.0}.get)
-    assert rival.certainty == pytest.approx(0.5 / (1 + np.exp(-2)))
+    assert rival.certainty == pytest.approx(1 / (2 + np.exp(2 - 2)))
     assert numbered(candidates[0], candidates, {0: 60.0}.get).certainty == own.certainty
     film = Outline(0.8 * CORNERS + 0.2 * CORNERS[[3, 2, 1, 0]], family=-1)
     for rival, is_same in ((film, True), (replace(film, n_columns=100), False)):
         certainty = numbered(candidates[0], [*candidates[:2], rival], {0: 60.0, -1: 60.0}.get).certainty
-        assert certainty == pytest.approx(0.5 if is_same else 0.25)
+        assert certainty == pytest.approx(0.5 if is_same else 1 / (2 + np.exp(2)))
 
 
 @pytest.mark.parametrize(("odds", "offset"), [(3.5, 0), (1.0, None)])

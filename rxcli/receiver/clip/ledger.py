@@ -43,8 +43,6 @@ class Ledger:
         self._scene: TrackedScreen | None = None
         #: The clock that the first frames agreed on, where each shows little.
         self.start: Start | None = None
-        #: Probability that the screen's columns are numbered right.
-        self.certainty = 1.0
         #: Number of first frames of a scene whose results are held back until its picture is known, at first; and
         #: number that holds now, 0 once the picture is known.
         self._n_first = SETTINGS.first_frames if "tracking" in options.skip else 0
@@ -217,4 +215,4 @@ class Ledger:
         for burst in closed:
             del self._bursts[burst.number]
         going_on = [burst for burst in own if burst.number in shown]
-        return completed(waiting, self._timeline, closed, going_on, self.certainty, self._options, self._on_taps)
+        return completed(waiting, self._timeline, closed, going_on, self._options, self._on_taps)

@@ -62,6 +62,8 @@ class ClipReceiver:
         self._outline: Outline | None = None
         #: Log-odds that the picture moves on the screen, and whether it was another one before.
         self._film_log_odds, self._has_changed = SETTINGS.film_log_odds, False
+        #: Probability that the screen's columns are numbered right.
+        self._certainty = 1.0
 
     def receive_next(self, source: Source) -> list[FrameResult]:
         """Receive the next frame; returns the results that are complete."""
@@ -93,6 +95,7 @@ class ClipReceiver:
         if isinstance(view, Failure):
             waiting.update(status=view.status, remarks=(view.remark,), timing_ms=cache.timer.total())
             return ledger.add(waiting, scene_ends=True)
+        waiting.certainty = self._certainty
         waiting.update(
             **view.context.result_fields,
             remarks=remarks or tuple(filter(None, (self._camera.remark,))),
@@ -134,7 +137,7 @@ class ClipReceiver:
         located = located or self._camera.locate_again(cache, self._outline, self._corners)
         if isinstance(located, Failure):
             return located
-        self._ledger.certainty = located.outline.certainty
+        self._certainty = located.outline.certainty
         self._camera, acquired = self._camera.acquire(located, self._ledger.start, cache)
         self._corners = located.outline.corners
         if isinstance(acquired, Failure):

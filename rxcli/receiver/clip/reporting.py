@@ -21,7 +21,6 @@ def completed(
     timeline: Timeline,
     closed: Sequence[Burst],
     going_on: Sequence[Burst],
-    certainty: float,
     options: ReceiverOptions,
     on_taps: OnTaps | None,
 ) -> FrameResult:
@@ -32,7 +31,6 @@ def completed(
         timeline: that numbered its bursts.
         closed: its bursts that no later frame shows.
         going_on: its other bursts.
-        certainty: probability that the screen's columns are numbered right.
         options: of the receiver.
         on_taps: is given the arrays of every received frame.
     """
@@ -44,7 +42,7 @@ def completed(
         framing[end.index] = timeline.certainty(burst.copies)
     headerless = timeline.headerless(ended, len(view.snr))
     columns = assemble.clip_results(
-        assemble.FrameColumns(view.clock, view.snr, headerless, options.min_confidence, certainty, framing),
+        assemble.FrameColumns(view.clock, view.snr, headerless, options.min_confidence, waiting.certainty, framing),
         ended,
         lambda column: any(burst.probability(column) >= BELIEVABLE for burst in going_on),
     )

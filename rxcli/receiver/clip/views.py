@@ -68,6 +68,8 @@ class Waiting:
 
     result: FrameResult
     view: View | None = None
+    #: Probability that the screen's columns are numbered right.
+    certainty: float = 1.0
 
     def update(self, **fields: Any) -> None:
         """Set fields of the result."""

@@ -35,8 +35,10 @@ _REACH_GAIN = 1.4
 #: followed.
 _FIRST_STEPS, _LAST_STEPS, _COURSES = 3, 2, 2
 #: Contrast of the strongest comb's grid, as a share of the light it explains, from which no others are tried; number of
-#: combs that are fitted otherwise.
+#: others that are fitted to all windows.
 _PLAIN_CONTRAST, _N_FITTED = 0.15, 2
+#: Quantiles of the lit strips between which two grids differ by less than this many columns if they have the same ones.
+_MOST, _SAME_COLUMNS = (0.02, 0.98), 0.5
 #: Weights of the light that a grid explains and of its perspective in its score, against 1 for its contrast: fitted to
 #: the grids of 186 simulated scenes, one in four of a night, such that no bright one loses its own.
 _BY_EXPLAINED, _BY_PERSPECTIVE = 7.0, -1.0
@@ -48,11 +50,13 @@ _ONE_SCREEN = 0.9
 _POSSIBLE_CONTRAST = 0.5
 #: Log-odds relative to the likeliest first column down to which another one is possible.
 _MIN_LOG_ODDS = -12.0
+#: The same of a grid, down to which it is a rival.
+_NEAR_ODDS = -4.0
 #: Number of unlit columns at a side from which the side counts as not visible.
 _UNLIT_COLUMNS = 0.5
 #: Share of the light on the smaller side of a gap without light, its width from which perspective may miss a column,
 #: columns; coherence of lit strips; and log-odds of a unit of a grid's score.
-_MIN_BESIDE, _WIDE_GAP, _LIT_STRIP, _SCORE_ODDS = 0.03, 2.0, 0.2, 10.0
+_MIN_BESIDE, _WIDE_GAP, _LIT_STRIP, _SCORE_ODDS = 0.03, 2.0, 0.2, 5.0
 #: Strips and a grid of their columns.
 _Placed = tuple[PictureStrips, Grid]
 
@@ -95,15 +99,39 @@ def find_screens(
         fine = read_strips(plane, lens, n_parts=_PARTS)
         grid = narrow_grid(fine, narrow[0].sigma)
         if grid is not None:
-            return [_numbered(fine, grid, narrow, parts)]
+            return [_of_rivals([(fine, grid)], narrow, parts)]
     if not wide:
         return []
 
     def along(course: Course) -> PictureStrips:
         return read_strips(plane, lens, course=course)
 
-    placed = wide_grid(strips, wide[0].sigma, _POSSIBLE_CONTRAST, along)
-    return [_numbered(*placed, wide, parts)] if placed else []
+    placed = wide_grids(strips, wide[0].sigma, _POSSIBLE_CONTRAST, along)
+    return [_of_rivals(placed, wide, parts)] if placed else []
+
+
+def _of_rivals(
+    placed: Sequence[_Placed], layouts: Sequence[ColumnLayout], parts: Sequence[FloatArray] = ()
+) -> list[Outline]:
+    """Candidate outlines of grids, the likeliest grid first: outlines of its rivals are families of their own.
+
+    Args:
+        placed: grids, the best first.
+        layouts: that the screen may have.
+        parts: see `find_screens`.
+    """
+    rivals: list[tuple[float, list[Outline]]] = []
+    for own in _distinct([*placed, *_across_gap(*placed[0], layouts[0])]):
+        outlines = sorted(_numbered(*own, layouts, parts), key=lambda outline: -outline.log_odds)
+        likeliest = outlines[0].log_odds
+        relative = [replace(outline, log_odds=outline.log_odds - likeliest) for outline in outlines]
+        rivals.append((_SCORE_ODDS * _score(own[1]) + likeliest, relative))
+    rivals.sort(key=lambda rival: -rival[0])
+    return [
+        replace(outline, family=outline.family + number * len(layouts), rival_odds=odds - rivals[0][0])
+        for number, (odds, outlines) in enumerate(rivals)
+        for outline in outlines
+    ]
 
 
 def shows_narrow(plane: LightPlane) -> bool:
@@ -133,14 +161,14 @@ def _screens_apart(strips: PictureStrips, layouts: Sequence[ColumnLayout]) -> li
         return float(np.ptp(_light_across(part, grid, layouts[0].sigma)[1].ends))
 
     sides, too_many = strips.sides_of_gap(), max(layout.n_columns for layout in layouts) + 1
-    found = [own for side in sides if (own := wide_grid(side, layouts[0].sigma))]
+    found = [own for side in sides for own in wide_grids(side, layouts[0].sigma)[:1]]
     if len(found) < 2 or sum(n_lit(side, grid) for side, grid in found) < too_many:
         return []
-    together, whole = sum(grid.contrast for _, grid in found), wide_grid(strips, layouts[0].sigma)
-    if whole and whole[1].contrast > _ONE_SCREEN * together and n_lit(*whole) < too_many:
+    together, whole = sum(grid.contrast for _, grid in found), wide_grids(strips, layouts[0].sigma)
+    if whole and whole[0][1].contrast > _ONE_SCREEN * together and n_lit(*whole[0]) < too_many:
         return []
     clearest_first = sorted(found, key=lambda side_and_grid: -side_and_grid[1].explained)
-    return [_numbered(side, grid, layouts) for side, grid in clearest_first]
+    return [_of_rivals([own], layouts) for own in clearest_first]
 
 
 def size_refused(width: int, height: int) -> Remark | None:
@@ -172,13 +200,13 @@ def thinned(pixels: NDArray[np.uint8] | NDArray[np.uint16], black: float, white:
     return np.asarray((pixels[*steps] - np.float32(black)) / (white - black), np.float32)
 
 
-def wide_grid(
+def wide_grids(
     strips: PictureStrips,
     sigma: float,
     least: float = 1.0,
     along: Callable[[Course], PictureStrips] | None = None,
-) -> _Placed | None:
-    """The grid of wide columns with the best score, if its borders stand out.
+) -> list[_Placed]:
+    """Grids of wide columns whose borders stand out, each with other columns than those before, the best score first.
 
     Args:
         strips: of the picture, upright.
@@ -188,13 +216,14 @@ def wide_grid(
     """
     quiet = strips.without_common_light()
     combs = find_combs(quiet)
-    placed = [_fitted(strips, grid_of_comb(comb, strips), sigma, along) for comb in combs[:1]]
+    placed = [_fitted(own, grid, sigma, along) for own, grid in _starts(strips, combs[:1], sigma)]
     if not (placed and _is_plain(placed[0][1])):
         starts, course = _starts(strips, combs[1:], sigma), along and tilted_course(quiet)
         if along and course:
             starts += _leaning_starts(along, course, sigma)
-        placed += [_fitted(own, grid, sigma, along) for own, grid in starts]
-    return max((own for own in placed if _stands_out(*own, least)), key=lambda own: _score(own[1]), default=None)
+        placed += [_fitted(own, grid, sigma, along) for own, grid in _distinct(starts)[:_N_FITTED]]
+    distinct = _distinct([own for own in placed if _stands_out(*own, least)])
+    return [own for own in distinct if _SCORE_ODDS * (_score(own[1]) - _score(distinct[0][1])) > _NEAR_ODDS]
 
 
 def _is_plain(grid: Grid) -> bool:
@@ -203,12 +232,27 @@ def _is_plain(grid: Grid) -> bool:
 
 
 def _starts(strips: PictureStrips, combs: Sequence[Comb], sigma: float) -> list[_Placed]:
-    """Grids of the likeliest combs, from every fourth window."""
-    some = strips.blocks(slice(None, None, 4))
-    # Contrast needs borders that are in their place already.
-    grids = [with_light(some, grid_of_comb(comb, strips), sigma) for comb in combs]
-    likeliest = sorted(grids, key=lambda grid: -grid.explained - grid.contrast)[:_N_FITTED]
-    return [(strips, grid) for grid in likeliest]
+    """Grids of combs, moved to their columns, as contrast needs borders that are in their place already."""
+    some = _half(strips)
+    grids = (moved_by_waveforms(some, grid_of_comb(comb, strips), sigma, _FIRST_STEPS) for comb in combs)
+    return [(strips, with_light(some, grid, sigma)) for grid in grids]
+
+
+def _distinct(placed: Sequence[_Placed]) -> list[_Placed]:
+    """Grids by their score, the best first, leaving out any with the columns of a better one."""
+    out: list[_Placed] = []
+    for own in sorted(placed, key=lambda own: -_score(own[1])):
+        if not any(_has_columns_of(own, better) for better in out):
+            out.append(own)
+    return out
+
+
+def _has_columns_of(own: _Placed, better: _Placed) -> bool:
+    """Whether two grids have the same columns where there is light, however they are counted."""
+    (strips, grid), lit = better, better[0].coherence > _LIT_STRIP
+    x, y = strips.x[lit], strips.y[lit]
+    off = columns_at(own[1].coefficients, x, y) - columns_at(grid.coefficients, x, y)
+    return bool(lit.any()) and float(np.ptp(np.quantile(off, _MOST))) < _SAME_COLUMNS
 
 
 def _leaning_starts(along: Callable[[Course], PictureStrips], course: Course, sigma: float) -> list[_Placed]:
@@ -216,11 +260,8 @@ def _leaning_starts(along: Callable[[Course], PictureStrips], course: Course, si
     found: list[_Placed] = []
     for _ in range(_COURSES):
         strips = along(course)
-        for _, start in _starts(strips, find_combs(strips.without_common_light()), sigma):
-            grid = moved_by_waveforms(_half(strips), start, sigma, _FIRST_STEPS)
-            found.append((strips, with_light(_half(strips), grid, sigma)))
-        found = sorted(found, key=lambda own: -_score(own[1]))[:_N_FITTED]
-        course = found[0][1].course if found else course
+        found += _starts(strips, find_combs(strips.without_common_light()), sigma)
+        course = max(found, key=lambda own: _score(own[1]))[1].course if found else course
     return found
 
 
@@ -233,14 +274,13 @@ def _fitted(
     strips: PictureStrips, grid: Grid, sigma: float, along: Callable[[Course], PictureStrips] | None
 ) -> _Placed:
     """A grid moved to its columns; strips that lean are read anew along them."""
-    grid = moved_by_waveforms(_half(strips), grid, sigma, _FIRST_STEPS)
     if along and strips.course != UPRIGHT:
         strips = along(grid.course)
     return strips, with_light(strips, moved_by_waveforms(strips, grid, sigma, _LAST_STEPS), sigma)
 
 
 def _score(grid: Grid) -> float:
-    """Score by which grids are compared, a tenth of the log-odds.
+    """Score by which grids are compared, a fifth of the log-odds.
 
     The right grid explains most, but for grids of narrow columns, which lack contrast. Where lamps light columns unlike
     each other, grids of wide columns have the most contrast.
@@ -287,7 +327,6 @@ def _numbered(
     strips: PictureStrips, grid: Grid, layouts: Sequence[ColumnLayout], parts: Sequence[FloatArray] = ()
 ) -> list[Outline]:
     """Candidate outlines of a grid, one per possible first column; outlines of one layout share their rows."""
-    grid, certainty = _across_gap(strips, grid, layouts[0], parts)
     light, profile = _light_across(strips, grid, layouts[0].sigma, parts)
     stands_out = _stands_out(strips, grid)
     found: list[Outline] = []
@@ -304,7 +343,6 @@ def _numbered(
                 found.append(
                     Outline(
                         corners,
-                        certainty,
                         inferred=sides,
                         log_odds=log_odds,
                         family=family,
@@ -315,36 +353,26 @@ def _numbered(
                         grid=counted,
                     )
                 )
-    likeliest = max(candidate.log_odds for candidate in found)
-    found = [replace(candidate, log_odds=candidate.log_odds - likeliest) for candidate in found]
-    return sorted(found, key=lambda candidate: -candidate.log_odds)
+    return found
 
 
-def _across_gap(
-    strips: PictureStrips, grid: Grid, layout: ColumnLayout, parts: Sequence[FloatArray]
-) -> tuple[Grid, float]:
-    """The grid with the likeliest number of columns in its widest gap without light, and the probability of that.
+def _across_gap(strips: PictureStrips, grid: Grid, layout: ColumnLayout) -> list[_Placed]:
+    """The grid with a column less, and one more, in its widest gap without light, as behind a person; none without.
 
-    Each side of a gap, as behind a person, has its own columns, and perspective bridges it to about a column.
+    Each side of a gap has its own columns, and perspective bridges it to about a column.
     """
     start, end = strips.gap(_MIN_BESIDE)
     if layout.is_narrow or (end - start) * strips.step * abs(grid.coefficients[1]) < _WIDE_GAP:
-        return grid, 1.0
+        return []
     number, u = np.arange(strips.x.shape[1]), columns_at(grid.coefficients, strips.x, strips.y)
-    is_left, lit = number < start, strips.coherence > _LIT_STRIP
-    beside = lit & (is_left | (number >= end))
-    grids = []
-    for more in (0, -1, 1):
+    is_left = number < start
+    beside = (strips.coherence > _LIT_STRIP) & (is_left | (number >= end))
+    out: list[_Placed] = []
+    for more in (-1, 1):
         rival = grid_through(grid, strips.x[beside], strips.y[beside], (u + more * is_left)[beside])
-        rival = moved_by_waveforms(strips, rival, layout.sigma, 2 * _FIRST_STEPS) if more else grid
-        grids.append(with_light(strips, rival, layout.sigma))
-    odds = []
-    for rival in grids:
-        _, profile = _light_across(strips, rival, layout.sigma, parts)
-        _, numbers, _ = first_columns(profile, layout.n_columns, layout.aspect)
-        odds.append(_SCORE_ODDS * _score(rival) + np.logaddexp.reduce(numbers))
-    best = int(np.argmax(odds))
-    return grids[best], float(1 / np.exp(np.array(odds) - odds[best]).sum())
+        rival = moved_by_waveforms(strips, rival, layout.sigma, 2 * _FIRST_STEPS)
+        out.append((strips, with_light(strips, rival, layout.sigma)))
+    return out
 
 
 def _light_across(

@@ -21,10 +21,12 @@ class Outline:
     #: Screen number of the first column; None if it is uncertain or columns are counted from the left of the visible
     #: ones.
     column_offset: int | None = 0
-    #: Log-odds of its first column and number of columns relative to the likeliest.
+    #: Log-odds of its first column and number of columns relative to the likeliest of its grid.
     log_odds: float = 0.0
     #: Outlines of one family differ only in the first column.
     family: int = 0
+    #: Log-odds of its grid of columns relative to the likeliest one.
+    rival_odds: float = 0.0
     #: Whether light reaches to both ends of the picture, so that no side of the screen is in view.
     fills: bool = False
     #: Whether the columns' borders stand out by more than chance; if not, only packets show that it is a screen.

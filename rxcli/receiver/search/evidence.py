@@ -10,6 +10,8 @@ from rxcli.types import BELIEVABLE, BoolArray, Float32Array
 
 #: Columns of most screens. Evidence is scaled to them: narrower columns show the same light several times.
 USUAL_COLUMNS = 20
+#: Correlation of the slots of neighbouring columns from which they have the same packet.
+_REPEATED = 0.7
 
 
 def log_evidence(reception: Reception) -> float:
@@ -31,6 +33,11 @@ def fit(reception: Reception) -> float:
 def believable(reception: Reception) -> BoolArray:
     """(B, C) complete packets that are believable, whatever their column's number."""
     return reception.is_complete & (reception.packet_confidence >= BELIEVABLE)
+
+
+def is_whole(reception: Reception) -> bool:
+    """Whether every column has a believable packet that is not its neighbour's."""
+    return bool(believable(reception).any(axis=0).all() and (repeated_share(reception) < _REPEATED).all())
 
 
 def score(reception: Reception, evidence: float, log_prior: float) -> float:

@@ -72,28 +72,24 @@ def _existence(reception: Reception, n: int) -> float:
 def numbered(own: Outline, outlines: Sequence[Outline], score_of: Callable[[int], float | None]) -> Outline:
     """An outline with the probability that its columns are numbered as the screen's.
 
-    Packets do not depend on which column is the first, so within a family the prior alone decides; between families
-    the scores do.
+    Packets do not depend on which column is the first: within a family only the log-odds decide, between families the
+    scores as well. An outline with the same columns, as of a film between bars, numbers them equally.
 
     Args:
         own: the outline that was chosen.
         outlines: all that were proposed.
-        score_of: the best score under outlines of a family, or None if none was tried.
+        score_of: the best score under outlines of a family, without their log-odds, or None if none was tried.
     """
-    family_odds = np.array([outline.log_odds for outline in outlines if outline.family == own.family])
     likeliest = {outline.family: outline for outline in sorted(outlines, key=lambda outline: outline.log_odds)}
-    # An outline with the same columns, as of a film between bars, numbers them equally.
-    families = {
-        family for family, rival in likeliest.items() if family == own.family or not _has_columns_of(own, rival)
-    }
-    scores = np.array([score for family in families if (score := score_of(family)) is not None])
-    mine = score_of(own.family)
-    certainty = own.certainty / float(np.exp(np.sort(family_odds) - own.log_odds).sum())
-    if mine is not None:
-        certainty /= float(np.exp(np.sort(scores) - mine).sum())
-    return replace(
-        own, certainty=certainty, column_offset=own.column_offset if certainty >= SETTINGS.sure_certainty else None
-    )
+    scores = {own.family: score_of(own.family) or 0.0}
+    for family, rival in likeliest.items():
+        score = score_of(family)
+        if family != own.family and score is not None and not _has_columns_of(own, rival):
+            scores[family] = score
+    odds = [outline.log_odds + scores[outline.family] for outline in outlines if outline.family in scores]
+    certainty = own.certainty / float(np.exp(np.sort(odds) - own.log_odds - scores[own.family]).sum())
+    is_sure = certainty >= SETTINGS.sure_certainty
+    return replace(own, certainty=certainty, column_offset=own.column_offset if is_sure else None)
 
 
 def _has_columns_of(own: Outline, rival: Outline) -> bool:

@@ -22,7 +22,7 @@ from rxcli.receiver.search.cameras import (
     propose_cameras,
     relabelled_camera,
 )
-from rxcli.receiver.search.evidence import USUAL_COLUMNS
+from rxcli.receiver.search.evidence import USUAL_COLUMNS, is_whole
 from rxcli.receiver.search.hypothesis import Hypothesis, Scored
 from rxcli.receiver.search.outlines import without_borders
 from rxcli.receiver.search.settings import SETTINGS
@@ -93,10 +93,11 @@ class Proposer:
         screens, out = self._screens(), []
         if camera.hypothesis is not None:
             screens = tuple(screen for screen in screens if screen.packet_slots == camera.hypothesis.packet_slots)
-        for outline in self.families():
-            for same_clock in _by_clock(outline, camera, screens).values():
-                screen = nearest_screen(same_clock, USUAL_COLUMNS)
-                out.append(self._hypothesis(outline, camera, screen, log_prior + SETTINGS.temper * outline.log_odds))
+        # Rivals of a grid are tried once there are packets, as its siblings.
+        for outline in (family for family in self.families() if not family.rival_odds):
+            prior = log_prior + SETTINGS.temper * outline.log_odds
+            nearest = (nearest_screen(same, USUAL_COLUMNS) for same in _by_clock(outline, camera, screens).values())
+            out += [self._hypothesis(outline, camera, screen, prior) for screen in nearest]
         return out
 
     def _screens(self) -> tuple[ScreenProfile, ...]:
@@ -167,10 +168,12 @@ class Proposer:
         hypothesis = replace(scored.hypothesis, camera=scored.context.camera, clock=None, profiles=None)
         outline, camera, log_prior = hypothesis.outline, hypothesis.camera, hypothesis.log_prior
         clock, n_columns = _clock_of(hypothesis.screen, camera), hypothesis.screen.columns
-        for candidate in self.families():
+        # Other columns than those of a grid all of whose columns have packets of their own would have fewer.
+        for candidate in () if is_whole(scored.reception) else self.families():
             same_clock = _by_clock(candidate, camera, self.options.screens).get(clock)
             if same_clock and candidate.family != outline.family:
                 change = SETTINGS.temper * (candidate.log_odds - outline.log_odds)
+                change += candidate.rival_odds - outline.rival_odds
                 yield self._hypothesis(candidate, camera, nearest_screen(same_clock, n_columns), log_prior + change)
         if camera.hypothesis is not None and scored.reception.is_long and scored.evidence < SETTINGS.plain:
             # What long exposures leave of a packet fits either way to some extent.
@@ -226,7 +229,7 @@ def _families(outlines: Sequence[Outline]) -> list[Outline]:
     for outline in outlines:
         families.setdefault(outline.family, []).append(outline)
     chosen = [likeliest_of_family(family) for family in families.values()]
-    return sorted(chosen, key=lambda outline: (-outline.log_odds, outline.family))
+    return sorted(chosen, key=lambda outline: (-outline.rival_odds, -outline.log_odds, outline.family))
 
 
 def likeliest_of_family(outlines: Sequence[Outline]) -> Outline:

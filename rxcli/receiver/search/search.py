@@ -193,9 +193,10 @@ class _Walk:
         return max(shown, key=lambda scored: (scored.hypothesis.outline.log_odds, scored.score), default=None)
 
     def score_of(self, family: int) -> float | None:
-        """The best score under outlines of a family, or None if none was tried."""
+        """The best score under outlines of a family, without their log-odds, or None if none was tried."""
         tried = (step for step in self._tried if step.fate != "no clock" and step.hypothesis.outline.family == family)
-        return max((step.score for step in tried), default=None)
+        scores = (step.score - SETTINGS.temper * step.hypothesis.outline.log_odds for step in tried)
+        return max(scores, default=None)
 
     def record(self, best: Scored | None, fate: str = "won") -> tuple[Tried, ...]:
         """Every hypothesis that was tried, in order, with the fate of the best one."""

@@ -18,7 +18,7 @@ from rxcli.receiver.screen.find import (
     ColumnLayout,
     find_screens,
     why_useless,
-    wide_grid,
+    wide_grids,
 )
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_between, grid_through
 from rxcli.receiver.screen.numbering import (
@@ -333,10 +333,10 @@ def test_grids_compare_by_contrast_and_by_what_they_explain(
     monkeypatch.setattr(find, "grid_of_comb", lambda grid, _: replace(grid))
     monkeypatch.setattr(find, "moved_by_waveforms", lambda _, grid, *__: grid)
     monkeypatch.setattr(find, "with_light", lit)
-    assert wide_grid(strips, 0.45)[1].coefficients[1] == rivals[0].coefficients[1]
+    assert wide_grids(strips, 0.45)[0][1].coefficients[1] == rivals[0].coefficients[1]
 
 
-def test_combs_are_fitted_by_their_likelihood_as_borders_out_of_place_stand_out_little(
+def test_all_combs_are_fitted_as_borders_out_of_place_stand_out_little(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     strips, true = read_strips(drawn("blobs")), grid_between(CORNERS, 20, (WIDTH, HEIGHT), None)
@@ -350,18 +350,18 @@ def test_combs_are_fitted_by_their_likelihood_as_borders_out_of_place_stand_out_
     monkeypatch.setattr(find, "grid_of_comb", lambda comb, _: comb)
     monkeypatch.setattr(find, "moved_by_waveforms", lambda _, grid, *__: replace(grid))
     monkeypatch.setattr(find, "with_light", lit)
-    assert wide_grid(strips, 0.45)[1].coefficients[1] == pytest.approx(true.coefficients[1])
+    assert wide_grids(strips, 0.45)[0][1].coefficients[1] == pytest.approx(true.coefficients[1])
 
 
 def test_one_grid_over_a_dark_gap_is_one_screen(monkeypatch: pytest.MonkeyPatch) -> None:
     plane, n_strips = drawn("gap"), read_strips(drawn("gap")).coherence.shape[1]
 
-    def too_narrow_at_a_side(strips: PictureStrips, *rest: Any) -> tuple[PictureStrips, Grid]:
-        (own, grid), share = wide_grid(strips, *rest), 1.0 if strips.coherence.shape[1] == n_strips else 1.5
-        factors = np.array([1, share, 1, 1, 1, 1])
-        return own, replace(grid, coefficients=grid.coefficients * factors)
+    def too_narrow_at_a_side(strips: PictureStrips, *rest: Any) -> list[tuple[PictureStrips, Grid]]:
+        factors = np.array([1, 1.0 if strips.coherence.shape[1] == n_strips else 1.5, 1, 1, 1, 1])
+        placed = wide_grids(strips, *rest)
+        return [(own, replace(grid, coefficients=grid.coefficients * factors)) for own, grid in placed]
 
-    monkeypatch.setattr(find, "wide_grid", too_narrow_at_a_side)
+    monkeypatch.setattr(find, "wide_grids", too_narrow_at_a_side)
     (outlines,) = find_screens(plane, [WIDE])
     assert np.abs(apart(outlines[0])).max() < 0.3
 
@@ -372,10 +372,13 @@ def test_the_columns_behind_a_person_are_counted_by_both_sides(missing: int) -> 
     u = columns_at(true.coefficients, strips.x, strips.y)
     lit = strips.coherence > 0.2
     wrong = grid_through(true, strips.x[lit], strips.y[lit], (u + missing * (u < 5))[lit])
-    grid, certainty = find._across_gap(strips, moved_by_waveforms(strips, wrong, 0.45, 6), WIDE, [])
-    off = grid.columns_at(CORNERS) - 20 * np.array([0, 1, 1, 0])
-    assert np.ptp(off) < 0.4
-    assert certainty > 0.9
+    start = with_light(strips, moved_by_waveforms(strips, wrong, 0.45, 6), 0.45)
+    outlines = find._of_rivals([(strips, start)], [WIDE])
+    rival = max(outline.rival_odds for outline in outlines if outline.rival_odds)
+    assert outlines[0].grid is not None
+    off = outlines[0].grid.columns_at(CORNERS) - 20 * np.array([0, 1, 1, 0])
+    assert np.abs(off).max() < 0.4
+    assert rival < -np.log(9)
 
 
 def profile_of(picture: str) -> LightProfile:
@@ -462,7 +465,7 @@ def test_faint_light_is_measured_by_its_own_noise(step: float, is_plain: bool) -
 def test_steady_light_around_the_screen_shows_the_first_column() -> None:
     dark, lighted = (find_outlines(drawn("dark sides", room=room), [WIDE]) for room in (0.0, 45.0))
     certainty = [
-        1 / np.exp([one.log_odds - candidates[0].log_odds for one in candidates]).sum()
+        1 / np.exp([one.log_odds - candidates[0].log_odds for one in candidates if not one.rival_odds]).sum()
         for candidates in (dark, lighted)
     ]
     assert round(float(np.median(apart(lighted[0])))) == 0
