@@ -58,7 +58,8 @@ def received(made: tuple[Scene, list[Capture]], *, known: bool, corners: bool = 
         options = replace(options, cameras=(build_camera_profile(scene, captures[0].exposure),), force_camera=True)
     if corners:
         options = replace(options, corners=captures[0].exposure.corners)
-    results = receive([Frame(one.pixels, "drawn", one.frame, one.time_s) for one in captures], options)
+    frames = [Frame(one.pixels, "drawn", one.frame, one.frame / scene.frame_rate_hz) for one in captures]
+    results = receive(frames, options)
     return explained(list(results)[-1])
 
 

@@ -35,7 +35,7 @@ def test_stripes_lean_across_or_downwards_and_photographs_hardly() -> None:
 
 @pytest.mark.parametrize(
     ("name", "exposure_s", "reason"),
-    [("rocket", None, "no_stripes_across"), ("rocket", 578e-6, "long_exposure"), ("astronaut", 0.01, "long_exposure")],
+    [("coffee", None, "no_stripes_across"), ("rocket", 578e-6, "long_exposure"), ("astronaut", 0.01, "long_exposure")],
 )
 def test_an_ordinary_photo_may_show_no_screen_that_sends(name: str, exposure_s: float | None, reason: str) -> None:
     result = receive_frame(Frame(photo(name), "photo", metadata=Metadata(exposure_s=exposure_s)), ReceiverOptions())

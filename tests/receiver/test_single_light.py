@@ -24,7 +24,7 @@ def clip_of(kind: str, seed: int, n_frames: int) -> tuple[list[Frame], ReceiverO
     scene = no_data_scene(kind, np.random.default_rng([999, seed, 23]), n_frames)[0].scaled(0.5, keep_readout=True)
     take = prepare(scene, seed)
     captures = [take.frame(number) for number in range(n_frames)]
-    frames = [Frame(one.pixels, "drawn", one.frame, one.time_s) for one in captures]
+    frames = [Frame(one.pixels, "drawn", one.frame, one.frame / scene.frame_rate_hz) for one in captures]
     camera, corners = build_camera_profile(scene, captures[0].exposure), captures[0].exposure.corners
     return frames, ReceiverOptions(cameras=(camera,), force_camera=True, corners=corners)
 

@@ -17,7 +17,7 @@ from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import Float32Array, FloatArray
 
 #: Columns across the picture, or across a fifth of it; minimum number of strips per column.
-_MIN_PITCH, _MAX_PITCH, _MIN_COLUMN_STRIPS = 9.0, 46.0, 4.0
+MIN_PITCH, _MAX_PITCH, _MIN_COLUMN_STRIPS = 9.0, 46.0, 4.0
 #: Maximum turn and maximum changes of pitch across and along the columns, as shares of the pitch; step of all three at
 #: a corner of the picture, and of the columns across it, columns.
 _MAX_TURN, _MAX_ACROSS, _MAX_ALONG, _STEP = 0.12, 0.2, 0.3, 0.4
@@ -80,7 +80,7 @@ def _all_combs(strips: PictureStrips) -> list[Comb]:
     """The best comb of each pitch."""
     step = strips.step * strips.n_parts
     max_pitch = min(_MAX_PITCH, 1 / (_MIN_COLUMN_STRIPS * step))
-    pitches = np.arange(_MIN_PITCH, max_pitch, _STEP)
+    pitches = np.arange(MIN_PITCH, max_pitch, _STEP)
     y = strips.raw_y.mean(axis=1) * strips.n_parts
     found: list[Comb] = []
     for chosen, pairs, lit_pairs in strips.borders(pitches * strips.n_parts):

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.receiver.screen import geometry
-from rxcli.receiver.screen.combs import Comb, find_combs, grid_of_comb
+from rxcli.receiver.screen.combs import MIN_PITCH, Comb, find_combs, grid_of_comb
 from rxcli.receiver.screen.courses import is_upright, tilted_course
 from rxcli.receiver.screen.grid import Grid, columns_at, grid_through
 from rxcli.receiver.screen.numbering import LightProfile, first_columns, light_profile
@@ -318,9 +318,9 @@ def _followed(strips: PictureStrips, grid: Grid, middle: float, sigma: float) ->
 
 
 def _stands_out(strips: PictureStrips, grid: Grid, least: float = 1.0) -> bool:
-    """Whether borders half a column further on explain less, by `least` times what chance gives."""
+    """Whether columns are possible, and stand out: their borders explain more than half a column further on."""
     by_chance = grid.explained / np.sqrt(strips.picture_rows)
-    return bool(grid.contrast > least * by_chance)
+    return bool(grid.contrast > least * by_chance and np.hypot(*grid.coefficients[1:3]) >= MIN_PITCH)
 
 
 def _numbered(
