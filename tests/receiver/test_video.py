@@ -18,6 +18,7 @@ from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.options import SKIPS, ReceiverOptions
 from rxcli.receiver.channel.known_picture import ColumnLight, KnownPicture, Observation
+from rxcli.receiver.clip.camera import ClipCamera
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.clip.window import Source
 from rxcli.receiver.frame.cache import FrameCache
@@ -246,6 +247,25 @@ def test_another_scene_is_searched_anew(
     assert score.error_free >= share * score.expected
     numbers = [p.burst for r in got for c in r.columns[:1] for p in c.packets if p.burst is not None]
     assert numbers == sorted(numbers)
+
+
+def test_frames_keep_the_certainty_with_which_their_screen_was_found(
+    clip: Clip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    locate, n_unsure = ClipCamera.locate, 6
+
+    def unsure(camera: ClipCamera, cache: FrameCache, *rest: Any, **more: Any) -> Any:
+        located = locate(camera, cache, *rest, **more)
+        certainty = 0.5 if cache.frame.index < n_unsure else 1.0
+        return replace(located, outline=replace(located.outline, certainty=certainty))
+
+    monkeypatch.setattr(ClipCamera, "locate", unsure)
+    other = simulate(8, 8, "chelsea")
+    moved = [replace(frame, index=n_unsure + k, time_s=0.1 + frame.time_s) for k, frame in enumerate(other.frames)]
+    got = list(receive((*clip.frames[:n_unsure], *moved), clip.options))
+    confidence = [[p.confidence for r in part for p in r.packets] for part in (got[:n_unsure], got[n_unsure:])]
+    assert 0.4 < max(confidence[0]) <= 0.5
+    assert max(confidence[1]) > 0.9
 
 
 def test_wrong_times_do_not_make_the_only_possible_screen_unsure(clip: Clip) -> None:
