@@ -62,8 +62,6 @@ class ClipReceiver:
         self._outline: Outline | None = None
         #: Log-odds that the picture moves on the screen, and whether it was another one before.
         self._film_log_odds, self._has_changed = SETTINGS.film_log_odds, False
-        #: Probability that the screen's columns are numbered right.
-        self._certainty = 1.0
 
     def receive_next(self, source: Source) -> list[FrameResult]:
         """Receive the next frame; returns the results that are complete."""
@@ -95,7 +93,8 @@ class ClipReceiver:
         if isinstance(view, Failure):
             waiting.update(status=view.status, remarks=(view.remark,), timing_ms=cache.timer.total())
             return ledger.add(waiting, scene_ends=True)
-        waiting.certainty = self._certainty
+        assert self._outline is not None
+        waiting.certainty = self._outline.certainty
         waiting.update(
             **view.context.result_fields,
             remarks=remarks or tuple(filter(None, (self._camera.remark,))),
@@ -137,7 +136,6 @@ class ClipReceiver:
         located = located or self._camera.locate_again(cache, self._outline, self._corners)
         if isinstance(located, Failure):
             return located
-        self._certainty = located.outline.certainty
         self._camera, acquired = self._camera.acquire(located, self._ledger.start, cache)
         self._corners = located.outline.corners
         if isinstance(acquired, Failure):

@@ -23,7 +23,6 @@ from rxcli.receiver.screen.strips import UPRIGHT, Course, PictureStrips, read_st
 from rxcli.receiver.screen.waveforms import moved_by_waveforms, predicted_light, with_light
 from rxcli.types import Float32Array, FloatArray, Lens, LightPlane, Remark
 
-#: The next step where a picture is too dark.
 #: Minimum width and height of a picture, pixels, its maximum height in widths, beyond which a grid in perspective may
 #: have columns of no width, and minimum number of strips across it.
 MIN_SIZE_PX, MAX_TALL, _MIN_STRIPS = 96, 6, 120
@@ -242,12 +241,12 @@ def _distinct(placed: Sequence[_Placed]) -> list[_Placed]:
     """Grids by their score, the best first, leaving out any with the columns of a better one."""
     out: list[_Placed] = []
     for own in sorted(placed, key=lambda own: -_score(own[1])):
-        if not any(_has_columns_of(own, better) for better in out):
+        if not any(_shares_columns(own, better) for better in out):
             out.append(own)
     return out
 
 
-def _has_columns_of(own: _Placed, better: _Placed) -> bool:
+def _shares_columns(own: _Placed, better: _Placed) -> bool:
     """Whether two grids have the same columns where there is light, however they are counted."""
     (strips, grid), lit = better, better[0].coherence > _LIT_STRIP
     x, y = strips.x[lit], strips.y[lit]
