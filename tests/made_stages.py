@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.receiver.camera import CameraHypothesis
+from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.types import BurstPosteriors, Clock, FloatArray, RowProfiles
 
 

@@ -17,7 +17,7 @@ from scipy.optimize import minimize
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.population import Population
 from rxcli.lab.simulate.scenes import Scene
-from rxcli.receiver.plane import read_plane
+from rxcli.receiver.plane.read import read_plane
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.bright import bright_parts
 from rxcli.receiver.screen.find import ColumnLayout, find_screens

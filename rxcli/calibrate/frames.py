@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from rxcli.receiver.plane import tone_to_light
+from rxcli.receiver.plane.rows import tone_to_light
 from rxcli.types import Float32Array, Frame
 
 _GREEN = 1

@@ -11,7 +11,7 @@ from rxcli.calibrate.shutter import Axis, ShutterCalibration
 from rxcli.errors import ReceiverError
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.camera import camera_profile
+from rxcli.receiver.camera.camera import camera_profile
 from rxcli.receiver.receive import receive_frame
 from rxcli.results.reasons import sentence_of
 from rxcli.types import Frame

@@ -19,7 +19,8 @@ from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.in_common import named
 from rxcli.receiver.frame.passes import Reception, headerless, soft_bits
 from rxcli.receiver.frame.result import Failure, Received, failed, is_received
-from rxcli.receiver.plane import in_one_mix, orientation
+from rxcli.receiver.plane import orientation
+from rxcli.receiver.plane.colour import in_one_mix
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, search
 from rxcli.receiver.search.cameras import UNKNOWN, known_camera

@@ -1,7 +1,7 @@
 """With which screen and camera a frame was received."""
 
 from rxcli.profiles import CameraProfile, ScreenProfile
-from rxcli.receiver.camera import camera_profile
+from rxcli.receiver.camera.camera import camera_profile
 from rxcli.types import Frame, FrameResult
 
 

@@ -27,7 +27,7 @@ def column_map(
         screen: the profile that `result` names.
         camera: the profile that `result` names, or the estimated one.
     """
-    from rxcli.receiver.plane import read_plane
+    from rxcli.receiver.plane.read import read_plane
     from rxcli.receiver.screen.find import MIN_SIZE_PX
     from rxcli.receiver.screen.strips import read_strips
 

@@ -19,7 +19,7 @@ from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, check_profile, load_profile
-from rxcli.receiver import camera as blind
+from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Failure
 from rxcli.receiver.receive import receive
@@ -72,14 +72,12 @@ def test_an_unknown_camera_is_refitted_and_received(tmp_path: Path, told_exposur
     assert all(right)
 
 
-def _proposed(*rows_per_slot: float) -> list[blind.CameraHypothesis]:
+def _proposed(*rows_per_slot: float) -> list[CameraHypothesis]:
     known = {"packet_slots": OPTIONS.screens[0].packet_slots, "score": 100.0, "rows_per_slot_sd": 0.01}
     return [hypothesis_of(rows, number=n, curvature_sd=np.zeros(4), **known) for n, rows in enumerate(rows_per_slot)]
 
 
-def _chosen(
-    frame: Frame, proposed: Iterable[blind.CameraHypothesis], monkeypatch: pytest.MonkeyPatch
-) -> Found | Failure:
+def _chosen(frame: Frame, proposed: Iterable[CameraHypothesis], monkeypatch: pytest.MonkeyPatch) -> Found | Failure:
     monkeypatch.setattr(cameras, "propose", lambda *_, **__: list(proposed))
     return search(FrameCache(frame), OPTIONS)
 

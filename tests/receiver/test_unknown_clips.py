@@ -19,7 +19,7 @@ from rxcli.receiver.clip.views import Waiting
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.passes import Reception
 from rxcli.receiver.frame.result import Failure
-from rxcli.receiver.plane import CommonTexture
+from rxcli.receiver.plane.texture import CommonTexture
 from rxcli.receiver.receive import receive
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import Found, cameras

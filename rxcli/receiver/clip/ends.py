@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from rxcli.numerics import TINY
-from rxcli.receiver import plane
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.plane import tracked
+from rxcli.receiver.plane.rows import tone_to_light
 from rxcli.receiver.screen import geometry
 from rxcli.types import Float32Array, FloatArray, Frame
 
@@ -39,7 +39,7 @@ def _ends_of(frame: Frame, shift: FloatArray, context: FrameContext, n_rows: int
     n_columns, lens, tone = context.screens[0].columns, context.camera.lens, context.camera.tone
     corners = context.sampled_corners + shift
     outlines = geometry.column_outlines(corners, n_columns, 1, frame.width, frame.height, lens)
-    strips = tracked.map_strips(outlines, frame, lambda coded: plane.tone_to_light(tone, coded))
+    strips = tracked.map_strips(outlines, frame, lambda coded: tone_to_light(tone, coded))
     light, inside = tracked.sample_strips(frame, strips)[:, 0], outlines.inside[:, 0]
     ends = []
     for values, shown in ((light, inside), (light[:, ::-1], inside[:, ::-1])):

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver import plane
 from rxcli.receiver.clip.place import ScreenPlace
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.light import Crosstalk
 from rxcli.receiver.plane import tracked
+from rxcli.receiver.plane.rows import strips_per_column, tone_to_light
 from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.registration import Registration, ScreenTexture
 from rxcli.types import BoolArray, Float32Array, FloatArray, Frame, Outlines
@@ -67,10 +67,10 @@ class Follower:
         frame, corners, tone = context.frame, context.sampled_corners, context.camera.tone
         self._lens, self._screen, self._tails, self._named = context.camera.lens, screen, tails, named
         column_px = float(np.linalg.norm(corners[1] - corners[0])) / screen.columns
-        self.n_strips = min(plane.strips_per_column(column_px), SETTINGS.max_strips)
+        self.n_strips = min(strips_per_column(column_px), SETTINGS.max_strips)
         self._end_rows = unsure_rows or (SETTINGS.end_rows, SETTINGS.end_rows)
         outlines = self._outlines(frame, corners, are_ends_cut=unsure_rows is not None)
-        strips = tracked.map_strips(outlines, frame, lambda coded: plane.tone_to_light(tone, coded))
+        strips = tracked.map_strips(outlines, frame, lambda coded: tone_to_light(tone, coded))
         #: Where the screen is, and where the strips are read; the picture is known on the rows where it was first.
         self.place = ScreenPlace.at(corners, screen.columns, self._lens, log_odds)
         self.pose = self.origin = Pose(corners, corners, strips, strips, self._crosstalk_at(0.0))

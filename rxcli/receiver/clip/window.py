@@ -21,7 +21,7 @@ from rxcli.receiver.clip.ends import dark_ends
 from rxcli.receiver.clip.settings import SETTINGS
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.result import Failure
-from rxcli.receiver.plane import CommonTexture, shows_same
+from rxcli.receiver.plane.texture import CommonTexture, shows_same
 from rxcli.receiver.search import Found
 from rxcli.receiver.search.cameras import DEFAULT_TONE
 from rxcli.types import FloatArray, Frame

@@ -11,17 +11,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rxcli.receiver.frame.timer import Timer
-from rxcli.receiver.plane import (
-    RowNoise,
-    find_row_noise,
-    in_blinking_colours,
-    may_lag,
-    read_plane,
-    red_contrast,
-    sample_rows,
-    strips_per_column,
-    without_row_noise,
-)
+from rxcli.receiver.plane.colour import in_blinking_colours, may_lag, red_contrast
+from rxcli.receiver.plane.read import read_plane
+from rxcli.receiver.plane.row_noise import RowNoise, find_row_noise, without_row_noise
+from rxcli.receiver.plane.rows import sample_rows, strips_per_column
 from rxcli.receiver.screen import geometry
 from rxcli.types import Float32Array, FloatArray, Frame, Lens, LightPlane, Metadata, Outlines, RowProfiles
 

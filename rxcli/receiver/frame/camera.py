@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
-from rxcli.receiver.camera import CameraHypothesis
+from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.types import Lens
 
 

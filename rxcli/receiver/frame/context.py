@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.camera import in_time_order
+from rxcli.receiver.camera.camera import in_time_order
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.camera import FrameCamera
 from rxcli.receiver.frame.timer import Timer

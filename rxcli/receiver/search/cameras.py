@@ -7,19 +7,12 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, match_camera
-from rxcli.receiver.camera import (
-    CameraHypothesis,
-    ColumnStrips,
-    Stripes,
-    in_phase,
-    lens_of,
-    propose,
-    propose_slots,
-    strips_of,
-    summary,
-    why_not,
-)
-from rxcli.receiver.camera import settle as settle_hypothesis
+from rxcli.receiver.camera.advice import why_not
+from rxcli.receiver.camera.camera import lens_of, summary
+from rxcli.receiver.camera.fit import settle as settle_hypothesis
+from rxcli.receiver.camera.proposals import CameraHypothesis, in_phase, propose, propose_slots
+from rxcli.receiver.camera.stripes import Stripes
+from rxcli.receiver.camera.strips import ColumnStrips, strips_of
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.camera import FrameCamera

@@ -10,8 +10,8 @@ from rxcli.receiver.decode.steady import periodic_share
 from rxcli.receiver.frame.cache import FrameCache, key_of
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
-from rxcli.receiver.plane import turned
 from rxcli.receiver.plane.orientation import PORTRAIT
+from rxcli.receiver.plane.read import turned
 from rxcli.receiver.screen import find, geometry
 from rxcli.receiver.screen.bright import bright_parts
 from rxcli.receiver.screen.outline import Outline

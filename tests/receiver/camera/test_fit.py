@@ -7,7 +7,10 @@ import pytest
 from made_stages import clock_of, hypothesis_of
 
 from rxcli.protocol import encode_packet, payload_bits
-from rxcli.receiver import camera as blind
+from rxcli.receiver.camera.camera import summary
+from rxcli.receiver.camera.fit import settle
+from rxcli.receiver.camera.proposals import CameraHypothesis
+from rxcli.receiver.camera.strips import ColumnStrips
 from rxcli.receiver.light import NoiseModel
 from rxcli.types import Clock, FloatArray
 
@@ -18,7 +21,7 @@ BEND = np.array([-0.22, 0.1, 4e-4, -3e-4])
 SPREAD = 0.1
 
 
-def _strips(rng: np.random.Generator, curvature: FloatArray) -> tuple[blind.ColumnStrips, FloatArray]:
+def _strips(rng: np.random.Generator, curvature: FloatArray) -> tuple[ColumnStrips, FloatArray]:
     """Strips of a textured picture whose sensor rows are bent, and the slots (C, N) that they show."""
     bits = [rng.integers(0, 2, payload_bits(w, 11), dtype=np.uint8) for w in rng.integers(3, 8, COLUMNS)]
     lit = np.stack([np.tile(encode_packet(b, _weight(b)), 3)[:300] for b in bits]).astype(np.float64)
@@ -36,7 +39,7 @@ def _strips(rng: np.random.Generator, curvature: FloatArray) -> tuple[blind.Colu
         light += lit[np.arange(n)[:, None] // 4, slot] / 40
     picture = 0.2 * np.exp(np.cumsum(rng.normal(0, 0.01, (n, ROWS)), axis=1))
     light = picture * light + rng.normal(0, 0.003, light.shape)
-    strips = blind.ColumnStrips(
+    strips = ColumnStrips(
         light=light.astype(np.float32),
         inside=np.ones(light.shape, np.float32),
         x=x,
@@ -53,7 +56,7 @@ def _weight(bits: np.ndarray) -> int:
     return next(w for w in (3, 4, 5, 6, 7) if payload_bits(w, 11) == bits.size)
 
 
-def _hypothesis(curvature: FloatArray, reverse: bool = False) -> blind.CameraHypothesis:
+def _hypothesis(curvature: FloatArray, reverse: bool = False) -> CameraHypothesis:
     """A first estimate: a period that is off by a thousandth, most of the bend, an exposure too short."""
     known = {"packet_slots": LENGTH, "curvature": 0.9 * _as_stored(curvature, reverse)}
     return hypothesis_of(1.001 * ROWS_PER_SLOT, reversed=reverse, exposure_slots=1.3, **known)
@@ -63,13 +66,11 @@ def _as_stored(curvature: FloatArray, reverse: bool) -> FloatArray:
     return curvature * np.array([1.0, 1.0, -1.0, 1.0]) if reverse else curvature
 
 
-def _settled(
-    strips: blind.ColumnStrips, first: blind.CameraHypothesis, lit: FloatArray
-) -> tuple[blind.CameraHypothesis, float]:
-    return blind.settle(strips, first, _clock(first), lit.astype(np.float32), SPREAD)
+def _settled(strips: ColumnStrips, first: CameraHypothesis, lit: FloatArray) -> tuple[CameraHypothesis, float]:
+    return settle(strips, first, _clock(first), lit.astype(np.float32), SPREAD)
 
 
-def _clock(estimate: blind.CameraHypothesis) -> Clock:
+def _clock(estimate: CameraHypothesis) -> Clock:
     known = {name: getattr(estimate, name) for name in ("rows_per_slot", "exposure_slots", "packet_slots")}
     return clock_of(COLUMNS, row0=START - 0.6, n_slots=300, burst=np.zeros(3, np.int64), **known)
 
@@ -107,7 +108,7 @@ def test_the_file_states_the_least_exposure() -> None:
     found, _ = _settled(strips, replace(_hypothesis(np.zeros(4)), stated_exposure_slots=2.0), lit)
     assert found.exposure_slots == 2.0
     assert found.exposure_slots_sd == 0.0
-    assert "exposure_s" not in blind.summary(found, 17300.0)
+    assert "exposure_s" not in summary(found, 17300.0)
 
 
 def test_errors_are_as_large_as_their_standard_deviations() -> None:

@@ -19,12 +19,17 @@ from rxcli.lab.simulate.scenes import preset
 from rxcli.lab.simulate.sensor import Sensor
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, dump_profile, load_profile, usual_screens
-from rxcli.receiver import camera as blind
-from rxcli.receiver import plane
-from rxcli.receiver.camera import Stripes, proposals, stripes
+from rxcli.receiver.camera import proposals, stripes
+from rxcli.receiver.camera.advice import why_not
+from rxcli.receiver.camera.camera import camera_profile, in_time_order, lens_of, summary
 from rxcli.receiver.camera.curvature import curvature_terms
+from rxcli.receiver.camera.proposals import in_phase, propose, propose_slots
 from rxcli.receiver.camera.settings import SETTINGS
+from rxcli.receiver.camera.stripes import Stripes
+from rxcli.receiver.camera.strips import ColumnStrips, strips_of
 from rxcli.receiver.light import NoiseModel
+from rxcli.receiver.plane.read import read_plane
+from rxcli.receiver.plane.rows import sample_rows, strips_per_column
 from rxcli.receiver.receive import receive
 from rxcli.receiver.screen import geometry
 from rxcli.types import FloatArray, Frame, Lens
@@ -73,11 +78,11 @@ def phone(
 def stripes_of(frame: Frame, corners: FloatArray, n_columns: int = 20, *, may_bend: bool = True) -> Stripes:
     """Stripes of a frame as the pipeline makes them."""
     column_px = float(np.linalg.norm(corners[1] - corners[0])) / n_columns
-    n_strips = plane.strips_per_column(column_px)
+    n_strips = strips_per_column(column_px)
     outlines = geometry.column_outlines(corners, n_columns, n_strips, frame.width, frame.height)
-    profiles = plane.sample_rows(plane.read_plane(frame), outlines, "srgb")
+    profiles = sample_rows(read_plane(frame), outlines, "srgb")
     centre_x = (outlines.edges_x[1:] + outlines.edges_x[:-1]) / 2
-    return Stripes(blind.strips_of(profiles, centre_x, frame.width, frame.height, may_bend=may_bend))
+    return Stripes(strips_of(profiles, centre_x, frame.width, frame.height, may_bend=may_bend))
 
 
 @pytest.mark.parametrize(
@@ -95,7 +100,7 @@ def test_unknown_phones_are_proposed_and_fitted(
     frame, corners, truth = phone(
         screen, rows_per_slot, height, corrected=corrected, upside_down=upside_down, k1=k1, seed=height
     )
-    proposed = blind.propose(stripes_of(frame, corners), SCREENS)
+    proposed = propose(stripes_of(frame, corners), SCREENS)
     assert 0 < len(proposed) <= 2 * SETTINGS.n_proposed
     right = [one for one in proposed if one.packet_slots == 20 + 10 * truth["payload_symbols"]]
     right = [one for one in right if one.reversed == upside_down]
@@ -115,7 +120,7 @@ def test_unknown_phones_are_proposed_and_fitted(
 def test_of_noise_one_camera_is_proposed() -> None:
     noise = np.random.default_rng(1).integers(0, 256, (480, 640), np.uint8)
     corners = np.array([[0.0, 0.0], [639.0, 0.0], [639.0, 479.0], [0.0, 479.0]])
-    (proposed,) = blind.propose(stripes_of(Frame(cv2.GaussianBlur(noise, (0, 0), 2), "noise"), corners), SCREENS)
+    (proposed,) = propose(stripes_of(Frame(cv2.GaussianBlur(noise, (0, 0), 2), "noise"), corners), SCREENS)
     assert proposed.score < SETTINGS.min_score
 
 
@@ -126,7 +131,7 @@ def test_an_exposure_that_no_file_states_is_proposed(exposure_slots: float) -> N
     screen, rows_per_slot, height = ("paper-8k65", 8.0, 1600) if is_long else ("paper-17k3", 4.3, 960)
     frame, corners, _ = phone(screen, rows_per_slot, height, exposure_slots=exposure_slots)
     light = stripes_of(frame, corners)
-    best = blind.in_phase(light, blind.propose(light, SCREENS)[0])
+    best = in_phase(light, propose(light, SCREENS)[0])
     assert best.rows_per_slot == pytest.approx(rows_per_slot, rel=3e-3 if is_long else 5e-3)
     assert best.exposure_slots == pytest.approx(exposure_slots, abs=0.25 if is_long else 0.4)
 
@@ -136,7 +141,7 @@ def test_the_light_of_all_rows_shows_rows_per_slot_and_bend_before_packets(expos
     screen, rows_per_slot, height = ("paper-8k65", 7.7, 1500)
     frame, corners, truth = phone(screen, rows_per_slot, height, corrected=True, k1=k1, exposure_slots=exposure_slots)
     light = stripes_of(frame, corners)
-    best = blind.in_phase(light, blind.propose(light, SCREENS)[0])
+    best = in_phase(light, propose(light, SCREENS)[0])
     assert best.rows_per_slot == pytest.approx(rows_per_slot, rel=1.5e-3)
     lens = truth["camera"]["dist_coeffs"]
     true = np.array([lens[0] / 0.8**2, lens[1] / 0.8**4, lens[2] / 0.8, lens[3] / 0.8])
@@ -150,13 +155,13 @@ def test_the_light_of_all_rows_shows_rows_per_slot_and_bend_before_packets(expos
 def test_less_than_a_packet_gives_slots_and_leaves_length_and_direction_open(corrected: bool, k1: float) -> None:
     """Eighty of 130 slots are in view; stripes may be bent, which the file does not say."""
     frame, corners, _ = phone("data-17k3", 8.0, 720, corrected=corrected, k1=k1, exposure_slots=0.7)
-    proposed = blind.propose_slots(stripes_of(frame, corners))
+    proposed = propose_slots(stripes_of(frame, corners))
     assert {one.packet_slots for one in proposed} == {0}
     assert {(one.number, one.reversed) for one in proposed} >= {(0, False), (0, True)}
     right = [one for one in proposed if one.curvature.any() == corrected]
     assert min(abs(one.rows_per_slot / 8 - 1) for one in right) < 6e-3
     assert right[0].exposure_slots == pytest.approx(0.7, abs=0.4)
-    straight = blind.propose_slots(stripes_of(frame, corners, may_bend=False))
+    straight = propose_slots(stripes_of(frame, corners, may_bend=False))
     assert not any(one.curvature.any() for one in straight)
 
 
@@ -167,7 +172,7 @@ def test_less_than_a_header_in_view_is_no_error(n_rows: int) -> None:
     light, inside, x = (part[:, :n_rows] for part in (whole.light, whole.inside, whole.x))
     few = replace(whole, light=light, inside=inside, x=x, rows=whole.rows[:n_rows])
     for exposure_s in (None, 3e-5, 3e-4):
-        assert all(np.isfinite(found.score) for found in blind.propose(Stripes(few), SCREENS, exposure_s))
+        assert all(np.isfinite(found.score) for found in propose(Stripes(few), SCREENS, exposure_s))
 
 
 def _bend_error_slots(
@@ -177,7 +182,7 @@ def _bend_error_slots(
     camera = truth["camera"]
     width, height = camera["width"], camera["height"]
     curvature = np.array([estimated[name][0] for name in ("k1", "k2", "p1", "p2")])
-    lens = blind.lens_of(curvature, width, height)
+    lens = lens_of(curvature, width, height)
     assert lens is not None
     true = Lens(np.array(camera["camera_matrix"]), np.array(camera["dist_coeffs"]), corrected=True)
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -200,23 +205,23 @@ def test_bend_terms_are_the_lens_model_at_any_focal_length() -> None:
     matrix = np.array([[focal, 0, 399.5], [0, focal, 299.5], [0, 0, 1]])
     moved = geometry.distort(points, Lens(matrix, np.append(coefficients, 0.0), True))[:, 1] - points[:, 1]
     scaled = coefficients * (width / focal) ** np.array([2, 4, 1, 1])
-    terms = blind.curvature_terms(points[:, 0], points[:, 1], width, height)
+    terms = curvature_terms(points[:, 0], points[:, 1], width, height)
     np.testing.assert_allclose(scaled @ terms, moved, rtol=1e-9, atol=1e-9)
 
 
 def test_an_estimate_can_be_kept_as_a_profile() -> None:
     curvature = np.array([0.1, -0.2, 3e-4, -1e-4])
     hypothesis = hypothesis_of(5.0, curvature=curvature, exposure_slots=0.8, exposure_slots_sd=0.02)
-    estimated = blind.summary(hypothesis, 17300.0)
+    estimated = summary(hypothesis, 17300.0)
     assert estimated["line_delay_s"] == pytest.approx((1 / (5 * 17300), 0.001 / 5 / (5 * 17300)))
-    profile = blind.camera_profile(estimated, "mine", "Maker", "Phone X", 4032, 3024)
+    profile = camera_profile(estimated, "mine", "Maker", "Phone X", 4032, 3024)
     again = check_profile(tomllib.loads(dump_profile(profile)), CameraProfile, "mine")
     assert again == profile
     assert again.matches("maker", "phone x")
     mode = again.mode_for(4032, 3024)
     assert mode.exposure_s == pytest.approx(0.8 / 17300)
     assert again.lens is not None
-    lens, kept = blind.lens_of(curvature, 4032, 3024), geometry.lens_for(again.lens, 4032, 3024)
+    lens, kept = lens_of(curvature, 4032, 3024), geometry.lens_for(again.lens, 4032, 3024)
     points = np.array([[100.0, 200.0], [3900.0, 2800.0]])
     assert lens is not None
     np.testing.assert_allclose(geometry.distort(points, kept), geometry.distort(points, lens))
@@ -224,7 +229,7 @@ def test_an_estimate_can_be_kept_as_a_profile() -> None:
 
 def _flat_stripes(light: FloatArray) -> Stripes:
     n_rows = light.shape[1]
-    strips = blind.ColumnStrips(
+    strips = ColumnStrips(
         light=light.astype(np.float32),
         inside=np.ones(light.shape, np.float32),
         x=np.broadcast_to(np.linspace(10, 790, light.shape[0])[:, None], light.shape),
@@ -255,36 +260,36 @@ def test_pictures_that_cannot_work_are_named(kind: str, reason: str, monkeypatch
     if kind == "random":
         light = _striped(rng, n_rows) + rng.normal(0, 0.002, light.shape)
     found = _flat_stripes(light)
-    blind.propose(found, SCREENS)
+    propose(found, SCREENS)
     monkeypatch.setattr(stripes, "half_width", None)  # what was measured is not measured again for the reason
-    assert blind.why_not(found).reason == reason
+    assert why_not(found).reason == reason
 
 
 def test_pictures_without_stripes_propose_nothing() -> None:
-    assert not (blind.propose(_flat_stripes(np.zeros((40, 400))), SCREENS))
+    assert not (propose(_flat_stripes(np.zeros((40, 400))), SCREENS))
     rng = np.random.default_rng(4)
     noise = _flat_stripes(rng.normal(0.3, 0.002, (40, 400)))
-    assert not blind.propose(noise, SCREENS)
-    assert not blind.propose_slots(noise)
+    assert not propose(noise, SCREENS)
+    assert not propose_slots(noise)
 
 
 def test_a_spectrum_without_a_peak_proposes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """As of small pictures: it falls over all rates that slots may have."""
     light = _striped(np.random.default_rng(1), 400)
-    assert blind.propose_slots(_flat_stripes(light))
+    assert propose_slots(_flat_stripes(light))
     monkeypatch.setattr(proposals, "_slot_line", lambda columns: 1 / (1.0 + np.arange(50 * columns.shape[1])))
-    assert not blind.propose_slots(_flat_stripes(light))
+    assert not propose_slots(_flat_stripes(light))
 
 
 def test_rows_against_the_readout_are_turned_and_back() -> None:
     rng = np.random.default_rng(5)
     light, inside, rows = rng.random((2, 3, 7)), rng.random((2, 3, 7)) > 0.5, np.arange(4, 11)
     profiles = profiles_of(light, inside=inside, rows=rows, sensor_row=rows + rng.random((2, 3, 7)))
-    turned = blind.in_time_order(profiles, 20)
+    turned = in_time_order(profiles, 20)
     assert turned.rows.tolist() == list(range(9, 16))
     assert turned.sensor_row is not None
     np.testing.assert_array_equal(turned.light[..., 0], profiles.light[..., -1])
-    again = blind.in_time_order(turned, 20)
+    again = in_time_order(turned, 20)
     np.testing.assert_array_equal(again.rows, profiles.rows)
     np.testing.assert_allclose(again.sensor_row, profiles.sensor_row)
 
@@ -332,7 +337,7 @@ def test_dark_columns_do_not_hide_the_width_of_the_stripes() -> None:
         rows_per_slot, axis=1
     )
     places = np.zeros((40, n_rows)), np.arange(float(n_rows))
-    strips = blind.ColumnStrips(light, np.ones_like(light), *places, 20, NoiseModel(1e-9, 1e-9), 4000, n_rows)
+    strips = ColumnStrips(light, np.ones_like(light), *places, 20, NoiseModel(1e-9, 1e-9), 4000, n_rows)
     assert 0.4 < Stripes(strips).half_width / rows_per_slot < 1
 
 

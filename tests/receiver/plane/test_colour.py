@@ -15,8 +15,9 @@ from rxcli.ingest import open_source
 from rxcli.ingest.jpeg import colours_of as jpeg_colours_of
 from rxcli.ingest.luma import BT601, BT709, colours_of, luma_of, without_red
 from rxcli.receiver.frame.cache import FrameCache
-from rxcli.receiver.plane import in_blinking_colours, in_one_mix, may_lag, read_plane, red_contrast
+from rxcli.receiver.plane.colour import in_blinking_colours, in_one_mix, may_lag, red_contrast
 from rxcli.receiver.plane.orientation import turned_frame
+from rxcli.receiver.plane.read import read_plane
 from rxcli.types import Frame, Mosaic
 from tests.ingest_files import BAYER, XTRANS
 

@@ -8,7 +8,8 @@ import pytest
 
 from rxcli.receiver.frame import cache
 from rxcli.receiver.frame.cache import FrameCache
-from rxcli.receiver.plane import read_plane, sample_rows, turned
+from rxcli.receiver.plane.read import read_plane, turned
+from rxcli.receiver.plane.rows import sample_rows
 from rxcli.receiver.screen.geometry import column_outlines
 from rxcli.types import Frame, Lens, LightPlane, Outlines
 

@@ -7,7 +7,10 @@ from numpy.typing import NDArray
 
 from rxcli.ingest.luma import colours_of, luma_of
 from rxcli.receiver.frame.cache import FrameCache
-from rxcli.receiver.plane import find_row_noise, read_plane, row_noise, tone_to_light
+from rxcli.receiver.plane import row_noise
+from rxcli.receiver.plane.read import read_plane
+from rxcli.receiver.plane.row_noise import find_row_noise
+from rxcli.receiver.plane.rows import tone_to_light
 from rxcli.types import Colours, Frame, Metadata
 
 N_ROWS, N_PIXELS, ROWS_PER_SLOT = 1200, 960, 8

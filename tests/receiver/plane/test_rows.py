@@ -7,8 +7,9 @@ import pytest
 from ingest_files import BAYER, XTRANS
 from numpy.typing import NDArray
 
-from rxcli.receiver.plane import read_plane, strips_per_column, tone_to_light
-from rxcli.receiver.plane import sample_rows as sample_plane
+from rxcli.receiver.plane.read import read_plane
+from rxcli.receiver.plane.rows import sample_rows as sample_plane
+from rxcli.receiver.plane.rows import strips_per_column, tone_to_light
 from rxcli.types import Frame, Mosaic, Outlines, RowProfiles
 
 FloatArray = NDArray[np.float64]

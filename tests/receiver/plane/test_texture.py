@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rxcli.receiver.plane import CommonTexture, shows_same
+from rxcli.receiver.plane.texture import CommonTexture, shows_same
 from rxcli.types import Frame
 
 SLOTS = 1 + 0.2 * np.sign(np.sin(np.arange(120) / 3))

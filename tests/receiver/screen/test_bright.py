@@ -9,7 +9,7 @@ import pytest
 from rxcli.lab.benchmark.trial import simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.plane import read_plane
+from rxcli.receiver.plane.read import read_plane
 from rxcli.receiver.receive import receive_frame
 from rxcli.receiver.screen.bright import bright_parts
 from rxcli.types import Frame

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rxcli.receiver.plane import read_plane
+from rxcli.receiver.plane.read import read_plane
 from rxcli.receiver.screen import find, geometry
 from rxcli.receiver.screen.bright import bright_parts
 from rxcli.receiver.screen.combs import find_combs

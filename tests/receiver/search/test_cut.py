@@ -12,7 +12,7 @@ from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import SLOTS_PER_SYMBOL
 from rxcli.receiver import receive
-from rxcli.receiver.camera import CameraHypothesis
+from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.camera import FrameCamera

@@ -7,7 +7,7 @@ import pytest
 from row_profiles import Shot, random_link, row_profiles, sigma_of
 
 from rxcli.options import ReceiverOptions
-from rxcli.receiver.camera import CameraHypothesis
+from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.receiver.frame.acquisition import Acquisition
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.camera import FrameCamera

@@ -18,7 +18,7 @@ from rxcli.lab.benchmark.trial import Trial, simulate_trial
 from rxcli.lab.simulate.scenes import preset
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import CameraProfile, ScreenProfile, check_profile, load_profile, usual_screens
-from rxcli.receiver import camera as blind
+from rxcli.receiver.camera.proposals import CameraHypothesis
 from rxcli.receiver.frame.cache import FrameCache
 from rxcli.receiver.frame.context import FrameContext
 from rxcli.receiver.frame.result import Failure
@@ -73,7 +73,7 @@ def test_the_order_of_proposals_screens_and_cameras_does_not_matter(
         for k in (-1, 0, 1)
         for family in (0, 1)
     ]
-    of_camera, siblings, propose = Proposer._of_camera, Proposer.siblings, blind.propose
+    of_camera, siblings = Proposer._of_camera, Proposer.siblings
 
     def shuffled(some: Iterable[Any]) -> list[Any]:
         some = list(some)
@@ -83,7 +83,6 @@ def test_the_order_of_proposals_screens_and_cameras_does_not_matter(
         monkeypatch.setattr(outlines, "possible_screens", lambda *_: [order(possible)])
         monkeypatch.setattr(Proposer, "_of_camera", lambda *given: order(of_camera(*given)))
         monkeypatch.setattr(Proposer, "siblings", lambda *given: order(siblings(*given)))
-        monkeypatch.setattr(blind, "propose", lambda *given, **named: order(propose(*given, **named)))
         screens, cameras = tuple(order(options.screens)), tuple(order(options.cameras))
         result = receive_frame(trial.frame, replace(options, screens=screens, cameras=cameras))
         return result, payloads_of(result)
@@ -367,9 +366,7 @@ def test_a_stated_readout_shows_the_slot_rate(
 ) -> None:
     """A picture shows rows per slot; the readout makes seconds of them, and the estimate stays that of the picture."""
     frame = Frame(np.zeros((1000, 40), np.uint8), "clip", metadata=Metadata(readout_s=stated_s))
-    ways = (
-        blind.CameraHypothesis(4.0, length, False, np.zeros(4), 1.0, 9.0, 0.1, np.zeros(4)) for length in (260, 130, 70)
-    )
+    ways = (CameraHypothesis(4.0, length, False, np.zeros(4), 1.0, 9.0, 0.1, np.zeros(4)) for length in (260, 130, 70))
     monkeypatch.setattr(cameras, "propose", lambda *_, **__: list(ways))
     monkeypatch.setattr(cameras, "_strips", lambda *_, **__: None)
     monkeypatch.setattr(cameras, "why_not", lambda *_: None)
