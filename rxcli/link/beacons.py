@@ -16,7 +16,7 @@ from rxcli.link.formats import unprotect_beacon
 from rxcli.link.known_bits import KnownBits, known_bits
 from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
 from rxcli.link.placement import Found, Placement, possible_placements
-from rxcli.link.softbits import LN2, MIN_SIMILARITY, TRY_FROM, Float32, log_likelihood, same_bits_llr, surprise
+from rxcli.link.softbits import LN2, MIN_SIMILARITY, TRY_FROM, Float32, log_likelihood, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
 _T = TypeVar("_T")
@@ -63,13 +63,13 @@ class _Round:
         """Gain in similarity from a frame, if its burst number 0 has position `phase` and its columns are placed so."""
         slots = (frame.slots + phase) % len(self.total)
         joined = self.total[slots] + placement.of(frame.total)
-        return float(surprise(joined).sum(dtype=np.float64) - self.levels[slots].sum()) - frame.alone
+        return float(surprise(joined) - self.levels[slots].sum()) - frame.alone
 
     def add(self, frame: _FrameSum, phase: int, placement: Placement, epoch: int) -> None:
         """Add a frame."""
         slots = (frame.slots + phase) % len(self.total)
         self.total[slots] += placement.of(frame.total)
-        self.levels[slots] = _levels(self.total[slots])
+        self.levels[slots] = surprise(self.total[slots], (1, 2, 3))
         self.alone += frame.alone
         self.epoch, self.phase, self.placement = epoch, phase, placement
 
@@ -77,7 +77,7 @@ class _Round:
         """Place the sums as the decoded message shows."""
         self.found, self.placement = found, placement.after(self.placement)
         self.total = placement.of(self.total).copy()
-        self.levels = _levels(self.total)
+        self.levels = surprise(self.total, (1, 2, 3))
 
 
 class _FrameSum:
@@ -89,12 +89,8 @@ class _FrameSum:
         self.total = np.zeros((self.slots.size, *soft.llr.shape[1:]), np.float32)
         np.add.at(self.total, place, soft.llr)
         #: Sum of `surprise` of every ratio; and log-likelihood ratio of bursts at the same position being equal.
-        self.alone = float(surprise(soft.llr).sum(dtype=np.float64))
-        self.similarity = float(_levels(self.total).sum()) - self.alone
-
-
-def _levels(total: Float32) -> NDArray[np.float64]:
-    return np.asarray(surprise(total).sum(axis=(1, 2, 3), dtype=np.float64))
+        self.alone = float(surprise(soft.llr))
+        self.similarity = float(surprise(self.total)) - self.alone
 
 
 class BeaconSearch:
@@ -208,7 +204,7 @@ def read_beacons(
         each that is a message.
     """
     buffers = np.stack([gathered(layout, total) for total in totals])
-    possible = np.flatnonzero([same_bits_llr(*each) >= _MIN_REPEATED for each in zip(buffers, levels, strict=True)])
+    possible = np.flatnonzero(surprise(buffers, (1,)) - levels >= _MIN_REPEATED)
     buffers = buffers[possible]
     known = known_bits(layout, buffers)
     bits = known.information(buffers) / layout.code.k

@@ -9,7 +9,7 @@ from rxcli.link.beacons import gathered, read_beacons
 from rxcli.link.known_bits import known_bits
 from rxcli.link.layout import BEACON_LENGTHS, BeaconLayout, beacon_layout
 from rxcli.link.placement import Found, Placement, possible_placements
-from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, same_bits_llr, surprise
+from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, surprise
 from rxcli.types import FrameSoftBits, MessageKind
 
 #: Largest number of sums of photographs that are kept, of ways to read one, and of sums that are decoded at once.
@@ -57,16 +57,16 @@ class CutPhotos:
 
     def add(self, soft: FrameSoftBits) -> list[Found]:
         """Add a photograph, and return the text that it completes."""
-        views = self._ranked(list(_views(soft)))[:_MAX_VIEWS]
+        views = list(_views(soft))
+        if not (views and self._layouts):
+            return []
+        views = self._ranked(views)[:_MAX_VIEWS]
         joined = [pair for known in self._sums for view in views if (pair := _joined(known, view)) is not None]
         joined.sort(key=lambda s: -s.rank)
         # The likeliest alone, then sums of more photographs.
         sums = [*views[:_ALONE], *joined[: 2 * _MAX_SUMS], *views[_ALONE:]]
         certain = [s for s in joined if s.similarity > _SAME]
-        self._sums = (certain and sorted(certain, key=lambda s: -s.rank)[:_MAX_SUMS]) or [
-            *sums[:_MAX_SUMS],
-            *self._sums,
-        ][: 2 * _MAX_SUMS]
+        self._sums = certain[:_MAX_SUMS] or [*sums[:_MAX_SUMS], *self._sums][: 2 * _MAX_SUMS]
         untried = [s for s in sums[: 2 * _MAX_SUMS] if not s.is_tried]
         for layout in self._layouts:
             found = next(_read(layout, untried), None)
@@ -77,13 +77,8 @@ class CutPhotos:
 
     def _ranked(self, views: list[_Sum]) -> list[_Sum]:
         """Views by the zeros that they show after a message, otherwise in their order."""
-        if not views:
-            return []
-        shown = [
-            known_bits(layout, np.stack([gathered(layout, view.total[None]) for view in views])).llr
-            for layout in self._layouts
-        ]
-        zeros = np.max(shown, axis=0) if shown else np.zeros(len(views))
+        buffers = ((layout, [gathered(layout, view.total[None]) for view in views]) for layout in self._layouts)
+        zeros = np.max([known_bits(layout, np.stack(shown)).llr for layout, shown in buffers], axis=0)
         ranked = [replace(view, zeros=float(llr)) for view, llr in zip(views, zeros, strict=True)]
         return sorted(ranked, key=lambda view: -round(view.zeros / _CLEAR_ZEROS))
 
@@ -98,9 +93,8 @@ def _read(layout: BeaconLayout, sums: list[_Sum]) -> Iterator[tuple[tuple[Messag
 
 def _views(soft: FrameSoftBits) -> Iterator[_Sum]:
     """What a photograph may show: every clock, start of its packets and placement of its columns, likeliest first."""
-    of_one_packet = [
-        c for c in (soft, *soft.alternatives) if same_bits_llr(c.llr.sum(axis=0), _level(c.llr)) > MIN_SIMILARITY
-    ]
+    candidates = (soft, *soft.alternatives)
+    of_one_packet = [c for c in candidates if surprise(c.llr.sum(axis=0)) - surprise(c.llr) > MIN_SIMILARITY]
     for group in range(3):
         for candidate in of_one_packet:
             llr = np.where(np.abs(candidate.llr) > _UNKNOWN, candidate.llr, 0).sum(axis=0, dtype=np.float32)
@@ -114,17 +108,13 @@ def _views(soft: FrameSoftBits) -> Iterator[_Sum]:
                 for placement in groups[group]:
                     total = placement.of(moved)
                     is_tried = candidate is soft and not soft.open_start
-                    yield _Sum(total, 0.0, _level(total), placement, (soft.source,), is_tried=is_tried)
-
-
-def _level(total: Float32) -> float:
-    return float(surprise(total).sum(dtype=np.float64))
+                    yield _Sum(total, 0.0, float(surprise(total)), placement, (soft.source,), is_tried=is_tried)
 
 
 def _joined(known: _Sum, view: _Sum) -> _Sum | None:
     """The sum of both, or None if they contradict each other."""
     total = known.total + view.total
-    level = _level(total)
+    level = float(surprise(total))
     gain = level - known.level - view.level
     if gain < MIN_SIMILARITY:
         return None

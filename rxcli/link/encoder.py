@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from rxcli.errors import UsageError
 from rxcli.link import ldpc
-from rxcli.link.formats import Announcement, beacon_body, pack_container, protect_beacon, protect_block
+from rxcli.link.formats import Announcement, beacon_body, pack_container, protect, protect_beacon
 from rxcli.link.layout import (
     ANNOUNCEMENT_PERIOD,
     BLOCK_BYTES,
     LABEL_BITS,
-    READY,
     BeaconLayout,
     FileLayout,
     Places,
@@ -122,9 +121,8 @@ class FileSending:
         for place in np.flatnonzero(announcing):
             burst = int(bursts[place])
             announcement = Announcement(self.mother, self.object_id, len(self.container), burst, self._crc)
-            out[place] = _labels(
-                announcement_layout(columns, payload_symbols), announcement.protected(), np.zeros(1, int)
-            )
+            of_announcements = announcement_layout(columns, payload_symbols)
+            out[place] = _labels(of_announcements, announcement.protected(), np.zeros(1, int))
         if not announcing.all():
             blocks, bits = layout.places(bursts[~announcing])
             packed = self._coded[blocks[..., None], bits >> 3]
@@ -157,14 +155,14 @@ class FileSending:
     def ready_bits(self) -> float:
         """Bits of information that a receiver needs for the complete file."""
         layout = self.layout(1, 1)
-        return READY[self.mother] * layout.code.k * layout.n_blocks
+        return layout.ready * layout.n_blocks
 
     @cached_property
     def _coded(self) -> NDArray[np.uint8]:
         """(B, bytes) every block's coded bits, packed."""
         layout, size = self.layout(1, 1), min(len(self.container), BLOCK_BYTES)
         pieces = [self.container[i : i + size].ljust(size, b"\0") for i in range(0, len(self.container), size)]
-        bits = [_bits(protect_block(piece, self.object_id, number)) for number, piece in enumerate(pieces)]
+        bits = [_bits(protect(piece, self.object_id, number)) for number, piece in enumerate(pieces)]
         batches = (np.stack(bits[i : i + _BATCH]) for i in range(0, len(bits), _BATCH))
         coded = (ldpc.encode(layout.code, batch)[:, : layout.n_bits] for batch in batches)
         return np.concatenate([np.packbits(batch, axis=1) for batch in coded])

@@ -16,12 +16,12 @@ from rxcli.link.formats import (
     Container,
     ContainerError,
     unpack_container,
+    unprotect,
     unprotect_announcement,
-    unprotect_block,
 )
 from rxcli.link.layout import ANNOUNCEMENT_PERIOD, FileLayout, announcement_layout
 from rxcli.link.placement import Placement, possible_placements
-from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, information, same_bits_llr, surprise
+from rxcli.link.softbits import MIN_SIMILARITY, TRY_FROM, Float32, information, surprise
 from rxcli.types import FILE_MEMORY_MB, FrameSoftBits, ObjectProgress
 
 #: Batch size for announcements whose copies do not decide.
@@ -144,9 +144,7 @@ class FileState:
         """Decode blocks; where one fails, the next attempt takes `more` bits of information."""
         self.frames_waited, numbers, object_id = 0, which.tolist(), self.layout.object_id
         llr = self.total[which] * np.float32(ldpc.LLR_STEP)
-        found = read_words(
-            self.layout.code, llr, lambda place, coded: unprotect_block(coded, object_id, numbers[place])
-        )
+        found = read_words(self.layout.code, llr, lambda place, coded: unprotect(coded, object_id, numbers[place]))
         read = {number: data for number, data in zip(numbers, found, strict=True) if data is not None}
         self.blocks |= read
         self.threshold[which] = self.known[which] + more
@@ -294,7 +292,7 @@ class FileSearch:
 
     def _look_for_announcement(self, epoch: int, number: int, placement: Placement, llr: Float32) -> None:
         buffer = gathered(self._layout, llr)
-        similarity = same_bits_llr(buffer, float(surprise(llr).sum(dtype=np.float64)))
+        similarity = surprise(buffer) - surprise(llr)
         if similarity < MIN_SIMILARITY or information(buffer).sum() < TRY_FROM * self._layout.code.k:
             return
         is_similar = similarity > -MIN_SIMILARITY

@@ -24,31 +24,17 @@ MIN_CONTAINER_BYTES = _CONTAINER_HEAD.size + 1 + _CONTAINER_TAIL.size
 _MAX_NAME_BYTES = 255
 
 
-def protect(data: bytes, object_id: int, block: int, crc_prefix: bytes = b"") -> bytes:
-    """Append the CRC-32 (over `crc_prefix` too) to `data` and whiten both."""
-    crc = zlib.crc32(crc_prefix + data)
-    return whiten(data + crc.to_bytes(CRC_BYTES, "big"), object_id, block)
+def protect(data: bytes, object_id: int, block: int) -> bytes:
+    """Append the CRC-32 to `data` and whiten both; the CRC of a file's block covers its object and number, too."""
+    is_of_file = object_id < ANNOUNCEMENT_ID
+    prefix = object_id.to_bytes(2, "big") + block.to_bytes(4, "big") if is_of_file else b""
+    return whiten(data + zlib.crc32(prefix + data).to_bytes(CRC_BYTES, "big"), object_id, block)
 
 
-def unprotect(coded: bytes, object_id: int, block: int, crc_prefix: bytes = b"") -> bytes | None:
+def unprotect(coded: bytes, object_id: int, block: int) -> bytes | None:
     """Undo `protect`; None if the CRC does not fit."""
-    plain = whiten(coded, object_id, block)
-    data, crc = plain[:-CRC_BYTES], int.from_bytes(plain[-CRC_BYTES:], "big")
-    return data if zlib.crc32(data, zlib.crc32(crc_prefix)) == crc else None
-
-
-def _block_prefix(object_id: int, block: int) -> bytes:
-    return object_id.to_bytes(2, "big") + block.to_bytes(4, "big")
-
-
-def protect_block(data: bytes, object_id: int, block: int) -> bytes:
-    """Information bits of a file's block, whose CRC covers its object and number, too."""
-    return protect(data, object_id, block, _block_prefix(object_id, block))
-
-
-def unprotect_block(coded: bytes, object_id: int, block: int) -> bytes | None:
-    """Data of a file's block, or None if its CRC does not fit."""
-    return unprotect(coded, object_id, block, _block_prefix(object_id, block))
+    data = whiten(coded, object_id, block)[:-CRC_BYTES]
+    return data if protect(data, object_id, block) == coded else None
 
 
 # -- beacons -----------------------------------------------------------------------------------------------------------
@@ -72,27 +58,22 @@ def beacon_body(kind: MessageKind, data: bytes) -> bytes:
     return (bytes([KINDS.index(kind)]) + data).ljust(length, b"\0")
 
 
-def parse_beacon(body: bytes) -> tuple[MessageKind, bytes] | None:
-    """Kind and message of a body with a valid CRC; None if it is no message."""
-    kind, data = body[0], body[1:]
-    if kind >= len(KINDS):
-        return None
-    if KINDS[kind] == "raw":
-        return "raw", data
-    text = data.rstrip(b"\0")
-    is_utf8 = text.decode("utf-8", "ignore").encode("utf-8") == text
-    return (KINDS[kind], text) if text and b"\0" not in text and is_utf8 else None
-
-
 def protect_beacon(body: bytes) -> bytes:
     """Information bits of a beacon's codeword."""
     return protect(body, BEACON_ID, len(body))
 
 
 def unprotect_beacon(coded: bytes) -> tuple[MessageKind, bytes] | None:
-    """Kind and message, or None if the information is no beacon's."""
+    """Kind and message, or None if the information is no beacon's or its body no message."""
     body = unprotect(coded, BEACON_ID, len(coded) - CRC_BYTES)
-    return None if body is None else parse_beacon(body)
+    if body is None or body[0] >= len(KINDS):
+        return None
+    kind, data = body[0], body[1:]
+    if KINDS[kind] == "raw":
+        return "raw", data
+    text = data.rstrip(b"\0")
+    is_utf8 = text.decode("utf-8", "ignore").encode("utf-8") == text
+    return (KINDS[kind], text) if text and b"\0" not in text and is_utf8 else None
 
 
 # -- announcements -----------------------------------------------------------------------------------------------------

@@ -213,33 +213,28 @@ class _Layers:
         pull *= np.sign(self._observed) * (self._observed < _KNOWN)
         return np.asarray(pull.sum(axis=0) / (np.linalg.norm(pull, axis=0) + 1e-6), np.float64)
 
-    def _gather(self, places: NDArray[np.intp]) -> NDArray[np.int16]:
-        return self._total.take(places, axis=0, out=self._incoming[: len(places)], mode="clip")
-
     def update(self) -> None:
         """Run one iteration: each row of checks in turn sends new messages to its bits."""
         for row, message in zip(self._rows, self._messages, strict=True):
-            self._update_row(row, message)
-
-    def _update_row(self, row: NDArray[np.intp], message: NDArray[np.int16]) -> None:
-        incoming, work = self._gather(row), self._work[: len(row)]
-        incoming -= message
-        parity = np.bitwise_xor.reduce(incoming, axis=0)
-        np.abs(incoming, out=work)
-        smallest, second = _two_smallest(work)
-        # The smallest magnitude goes to all bits except its source, which gets the second smallest. `work` becomes -1
-        # where a magnitude is larger than the smallest and 0 elsewhere, then the magnitude sent, then its signed value.
-        np.subtract(smallest, work, out=work)
-        work >>= 15
-        if_smallest = _normalised(second)
-        work &= if_smallest ^ _normalised(smallest)
-        work ^= if_smallest
-        np.bitwise_xor(incoming, parity, out=message)
-        message >>= 15
-        work ^= message
-        np.subtract(work, message, out=message)
-        incoming += message
-        self._total[row] = incoming
+            incoming, work = self._incoming[: len(row)], self._work[: len(row)]
+            self._total.take(row, axis=0, out=incoming, mode="clip")
+            incoming -= message
+            parity = np.bitwise_xor.reduce(incoming, axis=0)
+            np.abs(incoming, out=work)
+            smallest, second = _two_smallest(work)
+            # The smallest magnitude goes to all bits except its source, which gets the second smallest. `work` becomes
+            # -1 where a magnitude is larger than the smallest and 0 elsewhere, then the magnitude sent, then signed.
+            np.subtract(smallest, work, out=work)
+            work >>= 15
+            if_smallest = _normalised(second)
+            work &= if_smallest ^ _normalised(smallest)
+            work ^= if_smallest
+            np.bitwise_xor(incoming, parity, out=message)
+            message >>= 15
+            work ^= message
+            np.subtract(work, message, out=message)
+            incoming += message
+            self._total[row] = incoming
 
 
 def _two_smallest(magnitude: NDArray[np.int16]) -> tuple[NDArray[np.int16], NDArray[np.int16]]:

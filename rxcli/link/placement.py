@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.link.softbits import information
-from rxcli.types import ColumnResult, FloatArray, FrameResult, MessageKind, PacketResult, Remark
+from rxcli.types import ColumnResult, FloatArray, FrameResult, MessageKind, Remark
 
 #: Largest shift that is tried, columns; and information from which a column is one of the screen's, relative to that of
 #: the column with the most.
@@ -85,7 +85,8 @@ def placed(result: FrameResult, placement: Placement, n_columns: int) -> FrameRe
     result = result.with_columns_mirrored() if placement.mirrored else replace(result, mirrored=bool(result.mirrored))
     columns, corners = result.columns, result.corners
     if certainty < 1:
-        columns = tuple(replace(c, packets=tuple(_certain(p, certainty) for p in c.packets)) for c in columns)
+        sure = ([replace(p, confidence=min(p.confidence / certainty, 1.0)) for p in c.packets] for c in columns)
+        columns = tuple(replace(c, packets=tuple(packets)) for c, packets in zip(columns, sure, strict=True))
     if shift and n_columns > 1:
         by_number = {c.column + shift: replace(c, column=c.column + shift) for c in columns}
         unread = [ColumnResult(number, "no_packet", remark=Remark("not_read")) for number in range(n_columns)]
@@ -94,16 +95,11 @@ def placed(result: FrameResult, placement: Placement, n_columns: int) -> FrameRe
     return replace(result, columns=columns, corners=corners, remarks=remarks, column_certainty=1.0, column_offset=0)
 
 
-def _certain(packet: PacketResult, certainty: float) -> PacketResult:
-    return replace(packet, confidence=min(packet.confidence / certainty, 1.0))
-
-
 def _moved(corners: FloatArray, share: float) -> FloatArray:
     """Corners of the outline beside another one, by a share of its width."""
     import cv2
 
     unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
     to_picture = cv2.getPerspectiveTransform(unit, corners.astype(np.float32))
-    return np.asarray(
-        cv2.perspectiveTransform((unit + np.array([share, 0], np.float32))[None], to_picture)[0], np.float64
-    )
+    beside = unit + np.array([share, 0], np.float32)
+    return np.asarray(cv2.perspectiveTransform(beside[None], to_picture)[0], np.float64)

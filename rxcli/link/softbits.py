@@ -20,20 +20,14 @@ Event = Message | ReceivedObject
 # -- sums --------------------------------------------------------------------------------------------------------------
 
 
-def surprise(llr: Float32) -> Float32:
-    """ln(1 + e^llr) - ln 2, a term of `same_bits_llr`."""
-    # Single precision suffices for sums; its logarithm is fast, its log1p is not.
-    return np.asarray(np.log(1 + np.exp(-np.abs(llr))) + np.maximum(llr, 0) - np.float32(LN2), np.float32)
+def surprise(llr: Float32, axis: tuple[int, ...] | None = None) -> NDArray[np.float64]:
+    """Sum of ln(1 + e^llr) - ln 2 over some axes, or all.
 
-
-def same_bits_llr(together: Float32, alone: float) -> float:
-    """Log-likelihood ratio that added soft bits belong to the same bits, against independent bits.
-
-    Args:
-        together: sums of log-likelihood ratios.
-        alone: sum of `surprise` over the separate ratios.
+    That of added ratios, less that of the separate ones, is the log-likelihood ratio of equal against independent bits.
     """
-    return float(surprise(together).sum(dtype=np.float64)) - alone
+    # Single precision suffices for the terms; its logarithm is fast, its log1p is not.
+    terms = np.log(1 + np.exp(-np.abs(llr))) + np.maximum(llr, 0) - np.float32(LN2)
+    return np.asarray(terms.sum(axis, dtype=np.float64))
 
 
 def information(llr: NDArray[np.floating]) -> NDArray[np.float64]:

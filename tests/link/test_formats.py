@@ -16,7 +16,6 @@ from rxcli.link.formats import (
     beacon_body,
     pack_container,
     pack_parts,
-    parse_beacon,
     protect,
     protect_beacon,
     safe_name,
@@ -37,7 +36,7 @@ def test_texts_survive(text: str) -> None:
 def test_bodies_are_padded_to_the_smallest_length() -> None:
     lengths = {1: 8, 7: 8, 8: 20, 19: 20, 31: 32, 63: 64, 127: 128, 199: 200}
     assert {n: len(beacon_body("raw", b"x" * n)) for n in lengths} == lengths
-    assert parse_beacon(beacon_body("raw", b"ab")) == ("raw", b"ab" + bytes(5))
+    assert unprotect_beacon(protect_beacon(beacon_body("raw", b"ab"))) == ("raw", b"ab" + bytes(5))
 
 
 @pytest.mark.parametrize(("kind", "data"), [("text", b""), ("text", b"a\0b"), ("uri", b"\0"), ("raw", b"x" * 200)])
@@ -50,7 +49,7 @@ def test_bodies_that_cannot_be_are_refused(kind: str, data: bytes) -> None:
     "body", [b"\x03hello\0\0", b"\x01a\0b\0\0\0\0", b"\x01\xff\xfe\0\0\0\0\0", b"\x02" + bytes(7), b"\xffabcdefg"]
 )
 def test_bodies_of_no_message_are_none(body: bytes) -> None:
-    assert parse_beacon(body) is None
+    assert unprotect_beacon(protect_beacon(body)) is None
 
 
 @given(st.integers(0, 8 * 24 - 1))
