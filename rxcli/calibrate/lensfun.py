@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rxcli.calibrate.fitting import fit_distortion, grid_points
-from rxcli.errors import ProfileError, UsageError
+from rxcli.errors import ProfileError, UsageError, require
 from rxcli.profiles import LensModel
 from rxcli.types import Metadata
 
@@ -44,10 +44,9 @@ def lens_from_database(metadata: Metadata, width: int, height: int) -> LensfunMo
         UsageError: lensfunpy is not installed, or the metadata lacks something.
         ProfileError: the database does not know camera or lens, or holds no distortion of it.
     """
-    try:
-        import lensfunpy
-    except ImportError:
-        raise UsageError("the lensfun database needs the package lensfunpy", "pip install lensfunpy") from None
+    require("the lensfun database", "lensfunpy")
+    import lensfunpy
+
     focal_mm = metadata.focal_length_mm
     if not metadata.model or not focal_mm:
         hint = "give --camera-model, --lens and --focal-length"

@@ -258,10 +258,9 @@ def _gain(candidate: tuple[FloatArray, int], rival: tuple[FloatArray, int]) -> f
 def _fit_near(
     profile: FloatArray, frequency: float, n_harmonics: int, n_slow: int, first_row: int
 ) -> PeriodicFit | None:
-    """Slow mean, envelope less its constant 1, harmonics and frequency, fitted together; None where it runs off.
+    """Slow mean, envelope less its constant 1, harmonics and frequency, fitted together; None where it runs off."""
+    from scipy.optimize import least_squares
 
-    Levenberg-Marquardt on the normal equations.
-    """
     n, order = profile.size, np.arange(1, n_harmonics + 1)
     if 2 * (n_slow + n_harmonics) >= n:
         return None
@@ -272,41 +271,25 @@ def _fit_near(
         mean, envelope, cosines, sines, _ = np.split(state, borders)
         return slow @ mean, 1 + slow[:, 1:] @ envelope, cosines, sines, *_waves(rows, state[-1], n_harmonics)
 
-    def residual_of(model: tuple[FloatArray, ...]) -> FloatArray:
-        mean, envelope, a, b, cosine, sine = model
+    def residual_of(state: FloatArray) -> FloatArray:
+        mean, envelope, a, b, cosine, sine = parts(state)
         return np.asarray(mean + envelope * (cosine @ a + sine @ b) - profile)
 
-    def jacobian_of(model: tuple[FloatArray, ...]) -> FloatArray:
-        _, envelope, a, b, cosine, sine = model
+    def jacobian_of(state: FloatArray) -> FloatArray:
+        _, envelope, a, b, cosine, sine = parts(state)
         wave, slope = cosine @ a + sine @ b, 2 * np.pi * rows * (cosine @ (order * b) - sine @ (order * a))
         waves = np.hstack([cosine, sine, slope[:, None]]) * envelope[:, None]
         return np.hstack([slow, slow[:, 1:] * wave[:, None], waves])
 
     flat = np.hstack([slow, *_waves(rows, frequency, n_harmonics)])
     linear = np.linalg.lstsq(flat, profile, rcond=None)[0]
-    state = np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
-    model = parts(state)
-    left, damping = residual_of(model), 1e-6
-    for _ in range(_MAX_STEPS):
-        jacobian = jacobian_of(model)
-        scale = np.linalg.norm(jacobian, axis=0) + 1e-300
-        scaled = jacobian / scale
-        normal, slope = scaled.T @ scaled, scaled.T @ left
-        step = np.linalg.solve(normal + damping * np.eye(state.size), -slope) / scale
-        tried = parts(state + step)
-        tried_left = residual_of(tried)
-        gain = float(left @ left - tried_left @ tried_left)
-        if gain > 0:
-            state, model, left, damping = state + step, tried, tried_left, max(damping / 10, 1e-12)
-        else:
-            damping = max(10 * damping, 1e-4)
-        if abs(gain) <= 1e-6 * float(left @ left):
-            break
+    start = np.concatenate([linear[:n_slow], np.zeros(n_slow - 1), linear[n_slow:], [frequency]])
+    fitted = least_squares(residual_of, start, jacobian_of, method="lm", x_scale="jac", ftol=1e-6, max_nfev=_MAX_STEPS)
+    state, left, jacobian = fitted.x, fitted.fun, fitted.jac
     if not abs(state[-1] - frequency) <= 0.6 / n:
         return None
-    mean, envelope, cosines, sines, *_ = model
+    mean, envelope, cosines, sines, *_ = parts(state)
     trend = profile - slow @ np.linalg.lstsq(slow, profile, rcond=None)[0]
-    jacobian = jacobian_of(model)
     scaled = jacobian / (np.linalg.norm(jacobian, axis=0) + 1e-300)
     influence = scaled @ np.linalg.pinv(scaled.T @ scaled, hermitian=True)[-1] / np.linalg.norm(jacobian[:, -1])
     return PeriodicFit(
