@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -21,13 +22,13 @@ from rxcli.link.saving import save_objects
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import dump_profile
 from rxcli.results import report, summary
-from rxcli.results.baseline import load_baseline
+from rxcli.results.baseline import load_baseline, regressions
 from rxcli.results.cameras import estimated_camera
 from rxcli.results.columns import PAYLOAD_TABLE
 from rxcli.results.truth import Scorer, load_truth, truth_for
 from rxcli.runs import batch
 from rxcli.runs.journal import Head, Journal, Lines
-from rxcli.types import BELIEVABLE, FrameResult
+from rxcli.types import BELIEVABLE, Frame, FrameResult
 
 log = logging.getLogger(__name__)
 #: Options on which a source's results depend.
@@ -39,7 +40,9 @@ STDIN = "-"
 _STDIN_BYTES = 1 << 20
 
 
-def run(paths: tuple[str, ...], given: dict[str, Any], opened: batch.OpenSource | None = None) -> ExitCode:
+def run(
+    paths: tuple[str, ...], given: dict[str, Any], opened: Callable[[str], Iterator[Frame]] | None = None
+) -> ExitCode:
     """Decode the files and folders `paths` with the options that were `given`; `opened` opens files in this process."""
     sources = batch.collect_sources(paths, frozenset(KNOWN_SUFFIXES))
     _check(paths, given, len(sources))
@@ -56,13 +59,13 @@ def run(paths: tuple[str, ...], given: dict[str, Any], opened: batch.OpenSource 
     with _stdin_as_file(sources) as sources:
         if given["same_camera"]:
             configured = _with_same_camera(sources, configured)
-        decoder = batch.standard_decoder(configured, tap, after)
+        decoder = batch.Decoder(configured, tap, after)
         return _Run(decoder if opened is None else replace(decoder, open_source=opened), given, taken, sources).run()
 
 
 def _with_same_camera(sources: list[batch.Source], configured: ReceiverOptions) -> ReceiverOptions:
     """The options with the camera that the first photo with packets in half of its columns gives an estimate of."""
-    decoder = batch.standard_decoder(replace(configured, soft_bits=False, dump_dir=None))
+    decoder = batch.Decoder(replace(configured, soft_bits=False, dump_dir=None))
     for source, results in batch.decode_here(sources, decoder):
         photo = next(iter(results))
         if photo.gives_camera:
@@ -160,11 +163,11 @@ class _Run:
         asked = given["min_confidence"]
         #: Packets of less confidence do not count for the limits.
         self._min_confidence = BELIEVABLE if asked is None else asked
-        self._baseline = load_baseline(given["baseline"], self._min_confidence, given["slower"])
+        self._baseline = load_baseline(given["baseline"], self._min_confidence)
         bounds = ("max_ber", "min_packets", "expected_texts", "min_packet_confidence")
         self._limits = summary.Limits(**{name: given[name] for name in bounds})
         self._summaries: list[summary.SourceSummary] = []
-        self._photos = PhotoCollector(decoder.link_screens, decoder.file_memory_mb)
+        self._photos = PhotoCollector(decoder.options.screens, decoder.options.file_memory_mb)
         #: The frame with the most packets of those whose camera was estimated.
         self._estimated: FrameResult | None = None
         #: Name of a source -> where it is opened.
@@ -199,7 +202,7 @@ class _Run:
                 with suppress(OSError):
                     self._conclude()  # the reason why the run ended is more important than this
                 raise
-        for name in self._baseline.missing():
+        for name in sorted(self._baseline.keys() - {os.path.normpath(counted.source) for counted in self._summaries}):
             lost = summary.SourceSummary(name, regressions=["in the baseline, and not in this run"])
             self._summaries.append(lost)
         return worst([*self._conclude(), summary.exit_code(self._summaries, self._limits)])
@@ -262,7 +265,8 @@ class _Run:
     @contextmanager
     def _summarised(self, name: str) -> Iterator[tuple[summary.SourceSummary, Scorer | None]]:
         """The figures of a source and the scorer of its packets, if its truth is known; kept however it ends."""
-        counted, scorer = summary.SourceSummary(name, min_confidence=self._min_confidence), None
+        before, scorer = self._baseline.get(os.path.normpath(name)), None
+        counted = summary.SourceSummary(name, self._min_confidence, payloads=None if before is None else set())
         path = truth_for(name, self._given["truth"])
         try:
             scorer = None if path is None else Scorer(load_truth(path))
@@ -276,7 +280,8 @@ class _Run:
             if counted.n["frames"]:  # none: interrupted before the first
                 if scorer is not None:
                     counted.score, counted.faults = scorer.score(), scorer.faults()
-                counted.regressions = self._baseline.regressions(name)
+                if before is not None:
+                    counted.regressions = regressions(counted, before, self._given["slower"])
                 self._summaries.append(counted)
 
     def _count(self, result: FrameResult, counted: summary.SourceSummary) -> None:
@@ -284,7 +289,6 @@ class _Run:
         for message in result.messages:
             for photo in (before for before in self._summaries if before.source in message.photos):
                 photo.add_part(message)
-        self._baseline.add(result)
         if self._put_payloads is not None and result.packets:
             self._put_payloads(report.payload_rows(result))
 

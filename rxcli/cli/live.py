@@ -1,7 +1,5 @@
 """`vlc-rx live`: a V4L2 camera, its lock and its payloads as they come."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import sys
@@ -11,19 +9,26 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
 import click
+from tqdm import tqdm
 
 from rxcli.cli.common import force_argument, options, output, receiver_arguments, receiver_options
 from rxcli.cli.kinds import FOLDER, POSITIVE, Exposure
+from rxcli.cli.printing import is_terminal, print_line, print_text
 from rxcli.errors import ExitCode, UsageError, printable
-
-if TYPE_CHECKING:
-    from rxcli.ingest.v4l2 import CameraCounts, CameraSettings, LiveSource
-    from rxcli.outputs import Taken
-    from rxcli.results.aim import Aim, AimState, Brightness
-    from rxcli.types import Frame, FrameResult, ObjectProgress
+from rxcli.ingest.v4l2 import PIXEL_FORMATS, CameraCounts, CameraSettings, LiveSource, list_modes
+from rxcli.link.collector import Collector
+from rxcli.link.saving import save_objects
+from rxcli.outputs import JOURNAL, Taken, claim, claim_folder
+from rxcli.receiver.receive import receive
+from rxcli.results.aim import Aim, AimState, Brightness, brightness_of
+from rxcli.results.reasons import explained
+from rxcli.results.record import to_json_line
+from rxcli.results.report import format_frame, format_link, wrapped
+from rxcli.runs.journal import Journal
+from rxcli.types import Frame, FrameResult, ObjectProgress
 
 #: How often the status is written: on a terminal over itself, elsewhere line by line.
 _TERMINAL_S, _LOG_S = 0.2, 1.0
@@ -54,18 +59,10 @@ _BAR = 20
 def live(device: Path, **options: Any) -> int:
     """Receive from the V4L2 camera DEVICE, such as /dev/video0, until Ctrl-C."""
     if options["list_only"]:
-        from rxcli.ingest.v4l2 import list_modes
-
         click.echo("\n".join(map(str, list_modes(device))))
         return ExitCode.OK
     configured = replace(receiver_options(options, soft_bits=True), prompt=True)
     taken = _claim(device, options)
-    from rxcli.ingest.v4l2 import LiveSource
-    from rxcli.link.collector import Collector
-    from rxcli.link.saving import save_objects
-    from rxcli.receiver.receive import receive
-    from rxcli.results.reasons import explained
-
     source = LiveSource(
         device,
         _settings(options),
@@ -92,8 +89,6 @@ def live(device: Path, **options: Any) -> int:
 
 def _claim(device: Path, options: dict[str, Any]) -> Taken:
     """Refuse to write over what is there; returns the files of the run."""
-    from rxcli.outputs import JOURNAL, claim, claim_folder
-
     if options["out"] is not None:
         claim_folder("--out", options["out"])
     way_on = "name another file, or replace it with --force"
@@ -102,8 +97,6 @@ def _claim(device: Path, options: dict[str, Any]) -> Taken:
 
 
 def _settings(options: dict[str, Any]) -> CameraSettings:
-    from rxcli.ingest.v4l2 import PIXEL_FORMATS, CameraSettings
-
     name = options["pixel_format"] and options["pixel_format"].upper()
     if name is not None and name not in PIXEL_FORMATS:
         raise UsageError(f"--format {options['pixel_format']} is not known", f"known are {', '.join(PIXEL_FORMATS)}")
@@ -113,10 +106,6 @@ def _settings(options: dict[str, Any]) -> CameraSettings:
 
 def _writer(json_path: str | None, stack: ExitStack) -> Callable[[FrameResult], None]:
     """What is done with a result: a JSON line for each frame, or a table for those with packets."""
-    from rxcli.cli.printing import print_line
-    from rxcli.results.record import to_json_line
-    from rxcli.runs.journal import Journal
-
     if json_path is None:
         return _show
     put = print_line if json_path == "-" else stack.enter_context(closing(Journal(Path(json_path)))).append
@@ -124,21 +113,11 @@ def _writer(json_path: str | None, stack: ExitStack) -> Callable[[FrameResult], 
 
 
 def _show(result: FrameResult) -> None:
-    from rxcli.results.report import format_frame, format_link
-
+    """Print to stdout, above the block of the status where one stays on the terminal."""
     lines = [*format_link(result), *([format_frame(result)] if result.packets else [])]
     if lines:
-        _print_above("\n".join(lines))
-
-
-def _print_above(text: str) -> None:
-    """Print to stdout, above the block of the status where one stays on the terminal."""
-    from tqdm import tqdm
-
-    from rxcli.cli.printing import print_text
-
-    with tqdm.external_write_mode():
-        print_text(text)
+        with tqdm.external_write_mode():
+            print_text("\n".join(lines))
 
 
 @dataclass
@@ -156,13 +135,13 @@ class Status:
     _files: list[ObjectProgress] = field(default_factory=list)
     #: Of the newest frame.
     state: AimState | None = None
-    _aim: Aim | None = None
+    _aim: Aim = field(default_factory=Aim)
     _light: Brightness | None = None
     _height: int = 1
     _bars: list[Any] = field(default_factory=list)
     _shown_s: float = 0.0
 
-    def __enter__(self) -> Status:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -173,18 +152,13 @@ class Status:
 
     def watched(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """The frames, whose light and height are looked at as they pass."""
-        from rxcli.results.aim import brightness_of
-
         for frame in frames:
             self._light, self._height = brightness_of(frame), frame.height
             yield frame
 
     def update(self, result: FrameResult, files: Sequence[ObjectProgress] = ()) -> None:
         """Take a frame's result into account, and show the state if it is time."""
-        from rxcli.results.aim import Aim
-
         now_s = time.monotonic()
-        self._aim = self._aim or Aim()
         before, self.state = self.state, self._aim.update(result, now_s, self._height, self._light)
         self._files = list(files)
         self.n_complete += len(result.messages) + len(result.objects)
@@ -193,8 +167,6 @@ class Status:
 
     def show_if_due(self, now_s: float | None = None, changed: bool = False) -> None:
         """Show the state if it is time, also where no whole frame comes."""
-        from rxcli.cli.printing import is_terminal
-
         now_s = time.monotonic() if now_s is None else now_s
         if changed or now_s - self._shown_s >= (_TERMINAL_S if is_terminal(sys.stderr) else _LOG_S):
             self._shown_s = now_s
@@ -204,14 +176,9 @@ class Status:
         if self.quiet:
             return
         lines = [*format_status(self.state, self.source.counts), " | ".join(map(format_file, self._files))]
-        from rxcli.cli.printing import is_terminal
-        from rxcli.results.report import wrapped
-
         if not is_terminal(sys.stderr):
             _say(" | ".join(filter(None, lines)))
             return
-        from tqdm import tqdm
-
         lines = wrapped("\n".join(lines), max(shutil.get_terminal_size().columns - 1, 20)).split("\n")
         form = {"bar_format": "{desc}", "dynamic_ncols": True, "leave": True, "file": sys.stderr}
         while len(self._bars) < len(lines):

@@ -49,6 +49,8 @@ class SourceSummary:
     #: believable ones and their `bits`, `unsure`: the others, `sure`: at least `min_confidence`, `combined`: put
     #: together from several frames. `messages` and `files`: complete.
     n: Counter[str] = field(default_factory=Counter)
+    #: (column, payload) of the `sure` ones, where a baseline is held against them: a camera sends without end.
+    payloads: set[tuple[int, str]] | None = None
     confidence_sum: float = 0.0
     time_ms: float = 0.0
     #: Most columns in view of a frame.
@@ -95,6 +97,9 @@ class SourceSummary:
             messages=len(result.messages),
             files=len(result.objects),
         )
+        if self.payloads is not None:
+            sure = ((c.column, p) for c in result.columns for p in c.packets if p.confidence >= self.min_confidence)
+            self.payloads |= {(column, packet.payload) for column, packet in sure}
         self.confidence_sum += sum(packet.confidence for packet in packets)
         self.lowest_confidence = min((packet.confidence for packet in packets), default=self.lowest_confidence)
         total = result.timing_ms.get("total", math.nan)

@@ -17,8 +17,8 @@ import pytest
 from small_frames import N_COLUMNS, W, write_frame, write_profiles
 
 from rxcli.cli.main import run
-from rxcli.results.baseline import Baseline, Run
 from rxcli.results.record import from_record
+from rxcli.results.summary import SourceSummary
 from rxcli.results.undistort import UndistortedWriter
 from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
 
@@ -160,11 +160,10 @@ def test_what_fails_a_file_is_named_with_all_reasons(tmp_path: Path, decode: Dec
 def test_packets_are_remembered_for_a_baseline_alone() -> None:
     """A camera sends a thousand a second, for days."""
     column = ColumnResult(0, "ok", packets=(PacketResult(0.0, 2.0, 8, "ab", 0.99, 1e-3),))
-    for earlier, n_remembered in ({}, 0), ({"a": Run()}, 1):
-        baseline = Baseline(earlier, 0.5, 1.5)
-        for source in ("a", "b"):
-            baseline.add(FrameResult(source, 0, 0.0, "ok", columns=(column,)))
-        assert len(baseline.current) == n_remembered
+    for payloads, remembered in (None, None), (set[tuple[int, str]](), {(0, "ab")}):
+        counted = SourceSummary("a", payloads=payloads)
+        counted.add(FrameResult("a", 0, 0.0, "ok", columns=(column,)))
+        assert counted.payloads == remembered
 
 
 def test_a_run_is_held_against_an_earlier_one(tmp_path: Path, decode: Decode) -> None:

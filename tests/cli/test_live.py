@@ -256,7 +256,7 @@ def test_packets_are_shown_until_a_file_has_come(
             objects = (file,) if frame.index == 2 else ()
             yield FrameResult(frame.source, frame.index, frame.time_s, "ok", columns=columns, objects=objects)
 
-    monkeypatch.setattr("rxcli.receiver.receive.receive", receive)
+    monkeypatch.setattr("rxcli.cli.live.receive", receive)
     bench.plug_in()
     assert run(["live", "/dev/video0", "--until-complete", "--out", str(tmp_path / "out")]) == ExitCode.OK
     assert (tmp_path / "out" / "a.txt").read_bytes() == b"sent"
@@ -323,11 +323,12 @@ class TestStatus:
     def test_on_a_terminal_a_block_stays_in_place(self) -> None:
         """Three lines that are written over, payloads above them; not a line for every frame."""
         code = (
-            "import time; from pathlib import Path; from rxcli.cli.live import _print_above\n"
+            "import time; from dataclasses import replace; from pathlib import Path; from rxcli.cli.live import _show\n"
             "from test_live import result, LiveSource, Status\n"
             "with Status(LiveSource(Path('x'))) as status:\n"
             "    for _ in range(4):\n"
-            "        _print_above('payload'); status.update(result('ok', 20)); time.sleep(0.25)\n"
+            "        _show(replace(result('no_screen', 0), link_notes=('payload',)))\n"
+            "        status.update(result('ok', 20)); time.sleep(0.25)\n"
         )
         shown, here = bytearray(), Path(__file__).parent
         paths = os.pathsep.join([ENVIRONMENT["PYTHONPATH"], str(here), str(here.parent)])
