@@ -12,10 +12,14 @@ from typing import Any
 import numpy as np
 
 from rxcli.errors import InputError, UsageError
+from rxcli.options import ReceiverOptions
 from rxcli.runs.batch import Decoder
 from rxcli.types import ColumnResult, Frame, FrameResult, PacketResult
 
 N_COLUMNS = 3
+OPTIONS = ReceiverOptions()
+#: Options that the receiver refuses.
+WRONG = ReceiverOptions(cae="never")
 
 
 def open_fake(path: str) -> Iterator[Frame]:
@@ -43,9 +47,9 @@ def _may_kill(path: Path, kills: int | None) -> bool:
     return kills is None or n < kills
 
 
-def receive_fake(frames: Iterable[Frame], options: Any) -> Iterator[FrameResult]:
+def receive_fake(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
     """One result a frame, one frame late; the payloads follow from the name of the source."""
-    if options == "wrong":
+    if options.cae == "never":
         raise UsageError("the options make no sense", "give others")
     held: FrameResult | None = None
     for frame in frames:
@@ -69,6 +73,6 @@ def _packet(generator: random.Random) -> PacketResult:
     return PacketResult(10.0, 2.0, 40, payload, confidence=0.99, ber_hat=1e-4)
 
 
-def fake_decoder(options: Any = None) -> Decoder:
+def fake_decoder(options: ReceiverOptions = OPTIONS) -> Decoder:
     """The decoder to inject."""
-    return Decoder(options, open_fake, receive_fake)
+    return Decoder(options, open_source=open_fake, receive=receive_fake)

@@ -23,7 +23,7 @@ from rxcli.results.quality import qualities
 from rxcli.results.record import plain
 from rxcli.results.report import format_link
 from rxcli.results.truth import Scorer, load_truth, truth_for
-from rxcli.runs.batch import standard_decoder
+from rxcli.runs.batch import Decoder
 from rxcli.types import Frame, FrameResult
 
 #: Frames of a clip that its timeline shows.
@@ -113,7 +113,7 @@ def _received(
     found = truth_for(path, truth)
     scorer = Scorer(load_truth(found)) if found else None
     n_frames = max(_MAX_FRAMES, (number or 0) + 1)
-    frames, decoder = islice(open_source(path), n_frames), standard_decoder(options)
+    frames, decoder = islice(open_source(path), n_frames), Decoder(options)
     head = list(islice(frames, 1))  # so that a photo is read once
     pending: dict[int, dict[str, Any]] = {}
     results: list[FrameResult] = []

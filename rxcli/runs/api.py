@@ -19,7 +19,7 @@ from rxcli.options import check_values, is_number, receiver_options
 from rxcli.receiver.receive import receive as receive_frames
 from rxcli.receiver.receive import receive_frame
 from rxcli.results.dump import Taps, read_taps, taps_writer
-from rxcli.runs.batch import standard_decoder
+from rxcli.runs.batch import Decoder
 from rxcli.types import Frame, FrameResult, Metadata, Mosaic
 
 #: A picture: a file, an array of grey values, or a frame with what is known of it.
@@ -88,7 +88,7 @@ class Receiver:
 
     def _with_messages(self, results: Iterator[FrameResult]) -> Iterator[FrameResult]:
         """Results with the texts and files that they complete; the last one with what is left of others."""
-        return standard_decoder(self.options).linked(results)
+        return Decoder(self.options).linked(results)
 
     def tap(self, picture: Picture) -> tuple[FrameResult, Taps | None]:
         """Receive one photograph and keep the arrays of every stage boundary; None where reception ended before.

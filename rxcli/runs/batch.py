@@ -21,18 +21,17 @@ from threading import Lock, Semaphore, Thread, local
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+from rxcli import ingest
 from rxcli.errors import InputError, OutputError, ProfileError, ReceiverError, UsageError, is_out_of_memory, reason_of
-from rxcli.ingest import open_source
 from rxcli.ingest.ahead import in_order
 from rxcli.ingest.sniff import is_unnamed_picture
 from rxcli.link.collector import Collector
 from rxcli.options import ReceiverOptions
 from rxcli.outputs import OUTPUT_MARKER
-from rxcli.profiles import ScreenProfile
 from rxcli.results.dump import plain_name, taps_writer
 from rxcli.results.reasons import explained
 from rxcli.runs.processes import ONE_THREAD, environment, start_process
-from rxcli.types import FILE_MEMORY_MB, Frame, FrameResult
+from rxcli.types import Frame, FrameResult
 
 if TYPE_CHECKING:
     from multiprocessing.connection import Connection
@@ -41,10 +40,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-OpenSource = Callable[[str], Iterable[Frame]]
-Receive = Callable[[Iterable[Frame], Any], Iterator[FrameResult]]
-Tap = Callable[[Frame, str], None] | None
-After = Callable[[FrameResult, str], None] | None
 #: One source with its results, which are to be taken before the next source is asked for.
 Decoded = tuple["Source", Iterator[FrameResult]]
 
@@ -146,21 +141,37 @@ def _walk(folder: str, refused: Callable[[OSError], None]) -> Iterator[str]:
         yield from (os.path.join(parent, name) for name in sorted(files) if not name.startswith("."))
 
 
+def _receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
+    """Receive frames; the receiver is imported while the first frame is read."""
+
+    def load() -> None:
+        with suppress(Exception):  # which is raised again below
+            for name in _LOADED:
+                import_module(name)
+
+    loading = Thread(target=load, daemon=True)
+    loading.start()
+    frames = iter(frames)
+    try:
+        head = list(islice(frames, 1))
+    finally:
+        loading.join()
+    from rxcli.receiver.receive import receive
+
+    yield from receive(chain(head, frames), options, taps_writer(options.dump_dir))
+
+
 @dataclass(frozen=True, slots=True)
 class Decoder:
-    """How one source is decoded; picklable where its functions are."""
+    """How one source is decoded: by default, files are read and received. Picklable where its functions are."""
 
-    options: Any
-    open_source: OpenSource
-    receive: Receive
+    options: ReceiverOptions
     #: Sees every frame before it is received, and the subfolder of its source.
-    tap: Tap = None
+    tap: Callable[[Frame, str], None] | None = None
     #: Sees every result, and the subfolder of its source.
-    after: After = None
-    #: Screens whose messages and files are looked for; empty: none are.
-    link_screens: tuple[ScreenProfile, ...] = ()
-    #: Bound of all files under way, 2^20 bytes.
-    file_memory_mb: int = FILE_MEMORY_MB
+    after: Callable[[FrameResult, str], None] | None = None
+    open_source: Callable[[str], Iterable[Frame]] = ingest.open_source
+    receive: Callable[[Iterable[Frame], ReceiverOptions], Iterator[FrameResult]] = _receive
 
     def results(self, source: Source) -> Iterator[FrameResult]:
         """The results of all frames of `source`, at least one; an input that fails ends in an `unreadable` one.
@@ -171,9 +182,11 @@ class Decoder:
             OutputError: taps cannot be written.
         """
         problems: list[tuple[str, bool]] = []
-        count = 0
+        options, count = self.options, 0
+        if options.dump_dir is not None:  # each source has a place of its own for its taps
+            options = replace(options, dump_dir=options.dump_dir / source.subfolder)
         try:
-            for result in self.linked(self.receive(self._frames(source, problems), self._options_of(source))):
+            for result in self.linked(self.receive(self._frames(source, problems), options)):
                 result = replace(result, source=source.name)
                 if self.after is not None:
                     self.after(result, source.subfolder)
@@ -193,10 +206,10 @@ class Decoder:
 
         A photograph without any keeps its soft bits, and a clip its incomplete files, for others may show the same.
         """
-        if not self.link_screens:
+        if not self.options.soft_bits:
             yield from map(explained, results)
             return
-        collector = Collector(self.link_screens, self.file_memory_mb)
+        collector = Collector(self.options.screens, self.options.file_memory_mb)
         for number, (result, last) in enumerate(with_last(results)):
             taken = collector.add(result)
             if last:
@@ -223,11 +236,6 @@ class Decoder:
             raise
         except Exception as error:
             problems.append((_problem(error, source), bool(source.problem) or _may_pass(error)))
-
-    def _options_of(self, source: Source) -> Any:
-        """The options with a place of its own for the source's taps."""
-        folder = getattr(self.options, "dump_dir", None)
-        return self.options if folder is None else replace(self.options, dump_dir=folder / source.subfolder)
 
 
 def _problem(error: Exception, source: Source) -> str:
@@ -269,32 +277,6 @@ def with_last(results: Iterator[FrameResult]) -> Iterator[tuple[FrameResult, boo
         raise
     if held is not None:
         yield held, True
-
-
-def standard_decoder(options: ReceiverOptions, tap: Tap = None, after: After = None) -> Decoder:
-    """The decoder that reads files and receives them."""
-    screens = options.screens if options.soft_bits else ()
-    return Decoder(options, open_source, _receive, tap, after, screens, options.file_memory_mb)
-
-
-def _receive(frames: Iterable[Frame], options: ReceiverOptions) -> Iterator[FrameResult]:
-    """Receive frames; the receiver is imported while the first frame is read."""
-
-    def load() -> None:
-        with suppress(Exception):  # which is raised again below
-            for name in _LOADED:
-                import_module(name)
-
-    loading = Thread(target=load, daemon=True)
-    loading.start()
-    frames = iter(frames)
-    try:
-        head = list(islice(frames, 1))
-    finally:
-        loading.join()
-    from rxcli.receiver.receive import receive
-
-    yield from receive(chain(head, frames), options, taps_writer(options.dump_dir))
 
 
 def decode_here(sources: Iterable[Source], decoder: Decoder) -> Iterator[Decoded]:

@@ -30,7 +30,7 @@ from rxcli.results.columns import column_rows, packet_rows, text_rows
 from rxcli.results.overlay import Preview, picture_of, preview
 from rxcli.results.record import to_record
 from rxcli.results.summary import SourceSummary
-from rxcli.runs.batch import Source, standard_decoder, use_one_thread
+from rxcli.runs.batch import Decoder, Source, use_one_thread
 from rxcli.runs.processes import resident_bytes, start_process
 from rxcli.types import Frame, FrameResult, ObjectProgress
 
@@ -237,7 +237,7 @@ def answer_for(
     gathered, wait_s, published_s = _Gathered(options, time.process_time() + _CLIP_S), _PARTIAL_S, started_s
     if photos and photos.camera:  # the photos of one visitor are by one camera
         options = replace(options, cameras=(photos.camera, *options.cameras))
-    decoder = standard_decoder(options, gathered.tap)
+    decoder = Decoder(options, gathered.tap)
     try:
         for result in decoder.results(Source(name, str(path))):
             gathered.add(_without(photos.add(result) if photos else result, path))

@@ -17,7 +17,7 @@ from rxcli.ingest.v4l2 import CameraSettings, LiveSource
 from rxcli.options import ReceiverOptions
 from rxcli.results.aim import Aim, AimState, brightness_of
 from rxcli.results.columns import packet_rows, text_rows
-from rxcli.runs.batch import Source, standard_decoder, use_one_thread
+from rxcli.runs.batch import Decoder, Source, use_one_thread
 from rxcli.runs.processes import start_process
 from rxcli.types import FrameResult
 from rxcli.web.decoding import Previews, receive, send
@@ -101,7 +101,7 @@ def live_events(frames: Any, options: ReceiverOptions) -> Iterator[dict[str, Any
     """
     watched, aim = Previews(_WIDTH_PX, quality=70), Aim()
     prompt = replace(options, prompt=True)
-    decoder = replace(standard_decoder(prompt, watched.tap), open_source=lambda path: frames)
+    decoder = Decoder(prompt, watched.tap, open_source=lambda path: frames)
     packets: deque[dict[str, Any]] = deque(maxlen=_HISTORY)
     texts: list[dict[str, Any]] = []
 

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from commands import COMMAND, ENVIRONMENT
 from small_frames import write_frame, write_profiles
 
 from rxcli.cli.main import run
-from rxcli.ingest import open_source
 from rxcli.runs.batch import Decoder
 from rxcli.runs.journal import Journal
 from rxcli.types import FrameResult, ReceivedObject
@@ -107,9 +107,9 @@ def test_a_received_file_replaces_nothing_of_its_run(
             yield FrameResult(frame.source, 0, 0.0, "ok", objects=tuple(objects))
 
     def decoder(options: Any, *_: Any) -> Decoder:
-        return Decoder(options, open_source, receive)
+        return Decoder(replace(options, soft_bits=False), receive=receive)
 
-    monkeypatch.setattr("rxcli.runs.batch.standard_decoder", decoder)
+    monkeypatch.setattr("rxcli.runs.batch.Decoder", decoder)
     (folder / "old.txt").write_text("of another run")
     before = {name: (folder / name).read_bytes() for name in ("0.png", "0.truth.json")}
     outputs = ("--json", folder / "j.jsonl", "--summary", folder / "s.csv", "--truth", "auto", "--out", folder)

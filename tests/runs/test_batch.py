@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from fake_receiver import fake_decoder
+from fake_receiver import WRONG, fake_decoder
 
 from rxcli.errors import InputError, UsageError
 from rxcli.receiver.search.settings import SETTINGS
@@ -186,8 +186,8 @@ def test_a_source_that_ends_two_workers_costs_itself_only(tmp_path: Path) -> Non
 def test_wrong_options_end_a_run(tmp_path: Path) -> None:
     sources = mixed(tmp_path)
     for decoded in (
-        decode_here(sources, fake_decoder("wrong")),
-        decode_in_processes(sources, fake_decoder("wrong"), 2),
+        decode_here(sources, fake_decoder(WRONG)),
+        decode_in_processes(sources, fake_decoder(WRONG), 2),
     ):
         with pytest.raises(UsageError, match="make no sense"):
             lines(decoded)
