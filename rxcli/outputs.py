@@ -19,7 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 from typing import TYPE_CHECKING
 
-from rxcli.errors import OutputError, ReceiverError, UsageError, reason_of
+from rxcli.errors import OutputError, UsageError, reason_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -151,22 +151,18 @@ def claim_folder(option: str, folder: Path) -> None:
         UsageError: it is a file, or cannot be made or written.
         OutputError: the disk is full.
     """
-    try:
+    with writable(f"{option} {folder}", "name another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         _try_to_write(folder)
-    except (OSError, ValueError) as error:
-        raise unwritable(f"{option} {folder}", error, "name another folder") from None
 
 
 def _check_writable(output: Output) -> None:
     """Refuse an output in a read-only folder, or an existing read-only file."""
-    try:
+    with writable(output):
         path = output.path.resolve()
         if path.exists():
             path.open("r+b").close()
         _try_to_write(next(folder for folder in path.parents if folder.exists()))
-    except (OSError, RuntimeError) as error:
-        raise unwritable(output, error) from None
 
 
 def _try_to_write(folder: Path) -> None:
@@ -188,7 +184,7 @@ def claim_own_folder(option: str, folder: Path, known: Iterable[str] = (), force
     """
     claim_folder(option, folder)
     mark = folder / OUTPUT_MARKER
-    try:
+    with writable(f"{option} {folder}", "name another folder"):
         if mark.exists() or any(any(folder.glob(name)) for name in known):
             return
         if not any(folder.iterdir()):
@@ -196,8 +192,6 @@ def claim_own_folder(option: str, folder: Path, known: Iterable[str] = (), force
         elif not force:
             reason = f"{option} {folder}: the folder holds files that this command did not write"
             raise UsageError(reason, "name a new folder, or an empty one")
-    except OSError as error:
-        raise unwritable(f"{option} {folder}", error, "name another folder") from None
 
 
 def _identity(path: Path) -> object | None:
@@ -261,23 +255,19 @@ def replacing(path: Path, follow: bool = True, kept_mode: int = 0o777) -> Iterat
     Raises:
         UsageError, OutputError: the file cannot be written; any `OSError` of the block ends so.
     """
-    try:
-        if follow and is_stream(path):
+    if follow and is_stream(path):
+        with writable(path):
             yield path
-            return
-        target = path.resolve() if follow else path
-        with TemporaryDirectory(prefix=".vlc-rx-", dir=target.parent) as folder:
-            hidden = Path(folder, target.name)
-            yield hidden
-            with suppress(FileNotFoundError):
-                mode = target.lstat().st_mode
-                if stat.S_ISREG(mode):
-                    hidden.chmod(mode & kept_mode)
-            hidden.replace(target)
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise unwritable(path, error) from None
+        return
+    target = path.resolve() if follow else path
+    with writable(path), TemporaryDirectory(prefix=".vlc-rx-", dir=target.parent) as folder:
+        hidden = Path(folder, target.name)
+        yield hidden
+        with suppress(FileNotFoundError):
+            mode = target.lstat().st_mode
+            if stat.S_ISREG(mode):
+                hidden.chmod(mode & kept_mode)
+        hidden.replace(target)
 
 
 def write_whole(path: Path, content: str | bytes, follow: bool = True, kept_mode: int = 0o777) -> None:
@@ -291,18 +281,6 @@ def write_whole(path: Path, content: str | bytes, follow: bool = True, kept_mode
         hidden.write_bytes(data)
 
 
-def make_parent(path: Path) -> None:
-    """Create the folder of a file.
-
-    Raises:
-        OutputError: it cannot be made.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise unwritable(path, error) from None
-
-
 def tapped(path: Path, ours: re.Pattern[bytes], option: str) -> AbstractContextManager[Path]:
     """`replacing` for a file whose name is known only when it is written; its folder is made where there is none.
 
@@ -310,19 +288,29 @@ def tapped(path: Path, ours: re.Pattern[bytes], option: str) -> AbstractContextM
         UsageError: `path` exists and does not match `ours`.
         OutputError: it cannot be written.
     """
-    make_parent(path)
+    with writable(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     if is_stream(path):
         raise UsageError(f"{path}: is no file", "remove it, or name another folder")
     _check_ours(Output(option, path, ours), "name another folder")
     return replacing(path, follow=False)
 
 
-def unwritable(
-    what: object, error: BaseException, step: str = "name a file in a folder that can be written"
-) -> ReceiverError:
-    """Error for an output that cannot be written, with the reason: wrong usage, unless the disk is to blame."""
-    kind = OutputError if getattr(error, "errno", None) in _DISK_FAILS else UsageError
-    return kind(f"{what}: cannot be written ({reason_of(error)})", step)
+@contextmanager
+def writable(what: object, step: str = "name a file in a folder that can be written") -> Iterator[None]:
+    """Raise what the system says of an output as an error of ours; of a pipe whose reader has gone, as it is.
+
+    Raises:
+        UsageError: the output cannot be written.
+        OutputError: the disk is to blame.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        kind = OutputError if error.errno in _DISK_FAILS else UsageError
+        raise kind(f"{what}: cannot be written ({reason_of(error)})", step) from None
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:

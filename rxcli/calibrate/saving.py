@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 
 from rxcli.errors import UsageError
-from rxcli.outputs import make_parent, write_whole
+from rxcli.outputs import writable, write_whole
 from rxcli.profiles import NAME, CameraProfile, LensModel, ReadoutMode, dump_profile, load_profile
 from rxcli.types import Metadata
 
@@ -53,5 +53,6 @@ def write_profile(profile: CameraProfile, path: Path) -> None:
     Raises:
         InputError: it cannot be written.
     """
-    make_parent(path)
+    with writable(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, dump_profile(profile))

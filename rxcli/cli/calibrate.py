@@ -1,8 +1,8 @@
 """`vlc-rx calibrate`: lens and shutter of a camera, into a camera profile."""
 
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from rxcli.calibrate.shutter import ShutterCalibration, calibrate_shutter
 from rxcli.calibrate.slots import REVERSED, calibrate_slots
 from rxcli.cli.common import force_argument, json_output, options, output, refuse, write_json
 from rxcli.cli.groups import SuggestingGroup
-from rxcli.cli.kinds import FILE
+from rxcli.cli.kinds import FILE, Numbers
 from rxcli.errors import InputError, UsageError, printable
 from rxcli.ingest import KNOWN_SUFFIXES, open_source
 from rxcli.outputs import CAMERA, PICTURE, Output, claim, json_with
@@ -31,6 +31,7 @@ from rxcli.types import Frame, Metadata
 
 _PATH = click.Path(path_type=Path)
 _PATHS = click.argument("paths", nargs=-1, required=True, type=_PATH)
+_between_0_and = partial(click.FloatRange, 0, min_open=True, max_open=True)
 _NAME_HINT = "use letters, digits, dots, dashes and underscores"
 #: Where the result goes: the options that `_Results` takes.
 _RESULTS = (
@@ -115,15 +116,6 @@ class _Results:
             click.echo("\n".join(f"{label:11} {printable(text)}" for label, text in lines))
 
 
-def _integers(option: str, text: str, separator: str, example: str) -> tuple[int, ...]:
-    """The numbers of an option such as 9x6, as many as the example has."""
-    n = len(re.split(separator, example))
-    numbers = re.split(separator, text)
-    if len(numbers) != n or not all(re.fullmatch(r"\d{1,6}", number) for number in numbers) or "0" in numbers[-2:]:
-        raise UsageError(f"{option} {text!r} is not {n} whole numbers", f"write it as {example}")
-    return tuple(map(int, numbers))
-
-
 def _files(paths: tuple[Path, ...]) -> list[Path]:
     """The files named, and those of known suffix in the folders named."""
     sources = collect_sources(map(str, paths), KNOWN_SUFFIXES)
@@ -171,7 +163,7 @@ def _board_pictures(
 @calibrate.command(short_help="A lens, from pictures of a chessboard.")
 @_PATHS
 @options(
-    ("--board board_size", str, "9x6", "Inner corners, across x down."),
+    ("--board board_size", Numbers("9x6"), "9x6", "Inner corners, across x down."),
     ("--square square_mm", float, 25.0, "Side of a square, mm."),
     ("--charuco=DICT dictionary", str, None, "ChArUco board of this dictionary (DICT_5X5_100, ...)."),
     ("--marker marker_ratio", float, 0.75, "Marker over square side."),
@@ -180,14 +172,13 @@ def _board_pictures(
     *_RESULTS,
 )
 @force_argument
-def lens(paths: tuple[Path, ...], board_size: str, every: int, picture: Path | None, **given: Any) -> None:
+def lens(paths: tuple[Path, ...], board_size: tuple[int, int], every: int, picture: Path | None, **given: Any) -> None:
     """Lens model from PATHS: pictures of a chessboard or ChArUco board, folders of them, or clips.
 
     Pictures are taken as stored, never rotated. Fill the frame out to its corners and tilt the board both ways.
     """
     wanted = _Results(given)
-    columns, rows = _integers("--board", board_size, "[xX]", "9x6")
-    board, files = Board(columns, rows, **given), _files(paths)
+    board, files = Board(*board_size, **given), _files(paths)
     wanted.claim(files, "rms_px", "camera_matrix", picture=picture)
     unreadable, metadata = list[Rejected](), list[Metadata]()
     found, width, height = find_boards(_board_pictures(files, every, unreadable, metadata), board)
@@ -219,11 +210,11 @@ def lens(paths: tuple[Path, ...], board_size: str, every: int, picture: Path | N
 @calibrate.command(short_help="Readout and line delay, from a blinking lamp.")
 @_PATHS
 @options(
-    ("--frequency=HZ frequencies", [float], None, "Lamp; may be repeated."),
+    ("--frequency=HZ frequencies", [_between_0_and(1e7)], None, "Lamp; may be repeated."),
     ("--screen=NAME|FILE", str, None, "Screen profile, whose slot rate is known, instead of a lamp."),
     ("--axis", ("auto", "rows", "columns"), "auto", "Readout axis."),
-    ("--region=X,Y,W,H", str, None, "Search this part of the pictures only, stored pixels."),
-    ("--exposure exposure_s", float, None, "Exposure in seconds, where the files do not hold it."),
+    ("--region=X,Y,W,H", Numbers("100,80,640,400"), None, "Search this part of the pictures only, stored pixels."),
+    ("--exposure exposure_s", _between_0_and(1), None, "Exposure in seconds, where the files do not hold it."),
     ("--frames", click.IntRange(1), 8, "Frames used of a clip."),
     ("--mode", str, None, "Name of the readout mode to save.  [default: by the size, as 1920x1080]"),
     ("--export", FILE, None, "Write the readout as a JSON record for other programs."),
@@ -237,11 +228,7 @@ def shutter(paths: tuple[Path, ...], frequencies: tuple[float, ...], screen: str
     """
     lamp = "give the frequency of the lamp, as --frequency 1000"
     refuse((bool(frequencies) == bool(screen), "either --frequency or --screen is needed", lamp))
-    axis, region, exposure_s = given["axis"], given["region"], given["exposure_s"]
-    for value, option, limit in (*((f, "--frequency", 1e7) for f in frequencies), (exposure_s, "--exposure", 1)):
-        if value is not None and not 0 < value < limit:
-            raise UsageError(f"{option} must be above 0 and below {limit:g} (got {value:g})", "use hertz and seconds")
-    window = None if region is None else _integers("--region", region, ",", "100,80,640,400")
+    axis, window, exposure_s = given["axis"], given["region"], given["exposure_s"]
     refuse((screen and window, "--region goes with --frequency only", "leave it out"))
     wanted, files = _Results(given), _files(paths)
     export: Path | None = given["export"]
@@ -255,7 +242,7 @@ def shutter(paths: tuple[Path, ...], frequencies: tuple[float, ...], screen: str
     else:
         lights, tone_known = [frame_light(frame) for frame in chosen], raw or chosen[0].linear
         known_s = chosen[0].metadata.exposure_s if exposure_s is None else exposure_s
-        result = calibrate_shutter(lights, frequencies, along, known_s, window, tone_known)  # type: ignore[arg-type]
+        result = calibrate_shutter(lights, frequencies, along, known_s, window, tone_known)
     for warning in (*result.warnings, *result.doubts):
         click.echo(f"vlc-rx: {warning}", err=True)
     record, lines = _shutter_report(result)
@@ -369,13 +356,13 @@ def lensfun(path: Path, **given: Any) -> None:
 @calibrate.command(short_help="A lens from a Gyroflow profile; its readout, checked.")
 @click.argument("path", type=_PATH)
 @options(
-    ("--size=WxH", str, None, "Size of the pictures it is for. [default: as calibrated]"),
+    ("--size=WxH", Numbers("3840x2160"), None, "Size of the pictures it is for. [default: as calibrated]"),
     ("--photo", _PATH, None, "Check the readout with this picture of a screen."),
     ("--screen=NAME|FILE", str, None, "The screen of --photo."),
     *_RESULTS,
 )
 @force_argument
-def gyroflow(path: Path, size: str | None, photo: Path | None, screen: str | None, **given: Any) -> None:
+def gyroflow(path: Path, size: tuple[int, int] | None, photo: Path | None, screen: str | None, **given: Any) -> None:
     """Lens model from PATH, a lens profile of the Gyroflow community (.json).
 
     A user typed in the readout of such a profile. It is written only where it is measured on a picture of a known
@@ -385,9 +372,7 @@ def gyroflow(path: Path, size: str | None, photo: Path | None, screen: str | Non
         raise UsageError("--photo and --screen belong together", "give both, or neither")
     wanted = _Results(given)
     wanted.claim([path, *([photo] if photo else [])], "camera", "lens", "camera_matrix", screen=screen)
-    width_height: Any = None if size is None else _integers("--size", size, "[xX]", "3840x2160")
-    found = load_gyroflow(path, width_height)
-    measured = None
+    found, measured = load_gyroflow(path, size), None
     if photo and screen:
         measured = calibrate_slots(_frames([photo], 8), load_profile(screen, ScreenProfile))
     notes = [*found.notes, *([_agreement(found.readout_s, measured.readout_s)] if measured else [])]

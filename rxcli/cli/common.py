@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from rxcli.cli.kinds import CAMERA, SCREEN, SHARE, Point
+from rxcli.cli.kinds import CAMERA, SCREEN, SHARE, Numbers
 from rxcli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ _MEMORY_HELP = "Memory for the files that are being received; the least complete
 receiver_arguments = options(
     ("--screen=NAME|FILE|auto screens", [SCREEN], None, _SCREEN_HELP, {"envvar": "VLC_RX_SCREEN"}),
     ("--camera=NAME|FILE|auto cameras", [CAMERA], None, _CAMERA_HELP, {"envvar": "VLC_RX_CAMERA"}),
-    ("--corners", Point(), None, _CORNERS_HELP, {"nargs": 4, "metavar": "x,y x,y x,y x,y"}),
+    ("--corners", Numbers("120.5,80"), None, _CORNERS_HELP, {"nargs": 4, "metavar": "x,y x,y x,y x,y"}),
     ("--mirrored", None, False, "The picture is mirrored, as of some front cameras: count columns from its right."),
     ("--cae", ("auto", "always", "never"), "auto", "When the auto-encoder runs."),
     ("--min-confidence", SHARE, None, "Report only packets of at least this confidence. [default: all]"),

@@ -20,7 +20,7 @@ from rxcli.cli.sending import LIGHT, raw_sending, sending_of
 from rxcli.errors import UsageError, failure_explained
 from rxcli.link.encoder import FileSending, Sending, TestLight, packet_slots_of, payload_hex, visible_bits_of_burst
 from rxcli.link.slots import WITHOUT_TEXT, WRITERS, bytes_per_row, order_of
-from rxcli.outputs import ENCODED, TRUTH, claim, unwritable, write_whole
+from rxcli.outputs import ENCODED, TRUTH, claim, writable, write_whole
 from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.protocol import payload_bits
 from rxcli.results.report import plural
@@ -71,35 +71,32 @@ def encode(path: Path | None, out: Path, **options: Any) -> None:
     written.append(output("--truth", options["truth"], TRUTH))
     claim(written, filter(None, files), (options["screen"],), options["force"])
     plan = _plan(path, screen, options)
-    try:
+    with writable(out):
         if has_slots:
             _write_slots(plan, out, suffix)
         else:
             plan.write_csv(out) if suffix == ".csv" else plan.write_labels(out)
-        if options["truth"]:
-            write_whole(options["truth"], json.dumps(plan.truth(), indent=1) + "\n")
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise unwritable(out, error) from None
+    if options["truth"]:
+        write_whole(options["truth"], json.dumps(plan.truth(), indent=1) + "\n")
     click.echo(f"{out}: {plan.summary()}", err=True)
 
 
 def _plan(path: Path | None, screen: ScreenProfile, options: dict[str, Any]) -> _Plan:
-    given = (path, options["text"], options["uri"])
+    given, text = (path, options["text"], options["uri"]), options["weights"]
+    weights = _weights(text, screen.columns)
+    sending: Sending | TestLight
     if options["payload"] is None:
         sending = sending_of(*given)
-        n_bursts = _n_bursts(options, sending, screen)
-        weights = _weights(options["weights"], screen.columns, n_bursts)
         for row in weights:
             sending.check(row, screen.payload_symbols)
-        return _Plan(sending, screen, weights, n_bursts, options["only_column"])
-    is_both = any(value is not None for value in given)
-    refuse((is_both, "--payload excludes PATH, --text and --uri", "give one of them"))
-    weights = _weights(options["weights"], screen.columns)
-    raw = raw_sending(options["payload"], weights, options["seed"], options["same"])
-    n_bursts = _n_bursts(options, raw, screen)
-    return _Plan(raw, screen, _weights(options["weights"], screen.columns, n_bursts), n_bursts, options["only_column"])
+    else:
+        is_both = any(value is not None for value in given)
+        refuse((is_both, "--payload excludes PATH, --text and --uri", "give one of them"))
+        sending = raw_sending(options["payload"], weights, options["seed"], options["same"])
+    n_bursts, n = _n_bursts(options, sending, screen), len(weights)
+    reason = f"--weights {text} holds {n} bursts, {n_bursts} are sent"
+    refuse((n not in (1, n_bursts), reason, f"give {n_bursts}, or --bursts"))
+    return _Plan(sending, screen, weights, n_bursts, options["only_column"])
 
 
 def _write_slots(plan: _Plan, out: Path, suffix: str) -> None:
@@ -124,30 +121,23 @@ def _n_bursts(options: dict[str, Any], sending: Sending | TestLight, screen: Scr
     return sending.usual_bursts(screen.columns, screen.payload_symbols)
 
 
-def _weights(text: str, columns: int, n_bursts: int | None = None) -> NDArray[np.int64]:
-    """(n_bursts or 1, columns) weights."""
+def _weights(text: str, columns: int) -> NDArray[np.int64]:
+    """(n, columns) weights of bursts that take turns."""
+    data = None
+    if text.endswith(".json"):
+        with failure_explained(f"--weights {text}: cannot be read", "name a JSON file"):
+            data = Path(text).read_bytes()
     try:
-        values = np.asarray(_weight_values(text), np.int64)
+        found = [int(part) for part in text.split(",")] if data is None else json.loads(data)
+        values = np.asarray(found, np.int64)
         weights = np.broadcast_to(values, (values.shape[0] if values.ndim == 2 else 1, columns))
     except (ValueError, TypeError, OverflowError):
         raise UsageError(
             f"--weights {text}: no number, list of {columns} numbers, or JSON file of such lists",
             "give 1..9 for every column",
         ) from None
-    n, step = len(weights), f"give {n_bursts}, or --bursts"
-    refuse(
-        (weights.min() < 1 or weights.max() > 9, f"--weights {text}: weights are 1 to 9", "choose from 1..9"),
-        (n not in (1, n_bursts or n), f"--weights {text} holds {n} bursts, {n_bursts} are sent", step),
-    )
+    refuse((weights.min() < 1 or weights.max() > 9, f"--weights {text}: weights are 1 to 9", "choose from 1..9"))
     return weights
-
-
-def _weight_values(text: str) -> Any:
-    if not text.endswith(".json"):
-        return [int(part) for part in text.split(",")]
-    with failure_explained(f"--weights {text}: cannot be read", "name a JSON file"):
-        data = Path(text).read_bytes()
-    return json.loads(data)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,22 +13,33 @@ FILE = click.Path(dir_okay=False, path_type=Path, allow_dash=False)
 FOLDER = click.Path(file_okay=False, path_type=Path)
 
 
-class Point(click.ParamType[tuple[float, float]]):
-    """`x,y` in pixels."""
+class Numbers(click.ParamType[tuple[Any, ...]]):
+    """Several numbers, written as an example is: as many, with its separator, whole ones where it has no point.
 
-    name = "x,y"
+    Args:
+        example: such as "120.5,80"; or "9x6", of whose last two numbers none may be 0.
+        any_count: take any number of them.
+    """
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        """Two numbers."""
-        if isinstance(value, tuple):
-            return value
+    name = "numbers"
+
+    def __init__(self, example: str, any_count: bool = False) -> None:
+        self._example, self._any_count = example, any_count
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[Any, ...]:
+        """The numbers, each below a million."""
+        is_whole, separator = "." not in self._example, "x" if "x" in self._example else ","
+        n = 1 + self._example.count(separator)
         try:
-            x, y = (float(part) for part in str(value).split(","))
+            numbers = tuple(map(int if is_whole else float, str(value).lower().split(separator)))
         except ValueError:
-            self.fail(f"{value!r} is not two numbers, such as 120.5,80", param, ctx)
-        if not (abs(x) < 1e6 and abs(y) < 1e6):  # written so that NaN fails
-            self.fail(f"{value!r} is no position in a picture", param, ctx)
-        return x, y
+            numbers = ()
+        is_right = len(numbers) == n or (self._any_count and numbers)
+        is_size = not is_whole or (min(numbers, default=0) >= 0 and 0 not in numbers[-2:])
+        if not (is_right and is_size and all(abs(number) < 1e6 for number in numbers)):  # written so that NaN fails
+            count = "a list of" if self._any_count else f"{n} whole" if is_whole else n
+            self.fail(f"{value!r} is not {count} numbers, such as {self._example}", param, ctx)
+        return numbers
 
 
 class Exposure(click.ParamType[float]):

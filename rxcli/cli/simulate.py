@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
-from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ import click
 import numpy as np
 
 from rxcli import outputs
-from rxcli.cli.common import field_table, force_argument, options, output
-from rxcli.cli.kinds import FILE, FOLDER, POSITIVE, Exposure
+from rxcli.cli.common import field_table, force_argument, options, output, refuse
+from rxcli.cli.kinds import FILE, FOLDER, POSITIVE, Exposure, Numbers
 from rxcli.cli.printing import with_progress
 from rxcli.cli.sending import payload_bytes, sending_of
 from rxcli.errors import UsageError
@@ -33,6 +32,7 @@ _VIDEO_SUFFIXES = {".mp4": "h264", ".mov": "h264", ".mkv": "h264", ".avi": "mjpe
 #: Slots among the files of --waveforms.
 _SLOT_FILE = "slots.csv"
 #: Options that are fields of the scene by the same name.
+_CORNERS, _DELAYS = Numbers("120.5,80,900,80,900,600,120.5,600"), Numbers("0.1,0.25", any_count=True)
 _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm", "hand_px")
 
 
@@ -67,7 +67,7 @@ _LIST = {"is_eager": True, "expose_value": False, "callback": _list}
     ("--electrons", float, None, "Electrons of a green pixel that sees white, in one exposure."),
     ("--roll roll_deg", float, None, "Degrees about the line of sight; 180 for a camera upside down."),
     ("--fill", float, None, "Share of the picture's width that the screen fills, instead of a distance."),
-    ("--corners", str, None, "The screen's corners x,y,x,y,x,y,x,y on the sensor, instead of a pose."),
+    ("--corners", _CORNERS, None, "The screen's corners x,y,x,y,x,y,x,y on the sensor, instead of a pose."),
     ("--scale", click.FloatRange(0.02, 4), None, "Scale the sensor; rows and time shown scale with it."),
     ("--keep-readout/--keep-line-delay", None, False, "With --scale: keep the time of the whole readout."),
     ("--frames n_frames", click.IntRange(1), None, "Frames of a clip."),
@@ -75,7 +75,7 @@ _LIST = {"is_eager": True, "expose_value": False, "callback": _list}
     ("--bit-rate", click.IntRange(1), None, "Bits per second of a clip.  [default: constant quality]"),
     ("--hand hand_px", click.FloatRange(0), None, "Hold the camera in a hand: pixels from frame to frame."),
     ("--clock-error slot_rate_error_ppm", float, None, "Error of the slot rate, ppm."),
-    ("--column-delays", str, None, "Delays of the columns in slots: one each, or one for the largest random delay."),
+    ("--column-delays", _DELAYS, None, "Delays of the columns, slots: one each, or one for the largest random delay."),
     ("--start-slot", float, None, "Slot of the link at which row 0 starts.  [default: random]"),
     ("--set fields", [str], None, "A field of the preset, as isp.quality=85; may be given several times."),
     ("--waveforms", FOLDER, None, "Also write what drives a real screen."),
@@ -92,11 +92,8 @@ def simulate(out: Path, **options: Any) -> None:
     scene = _scene(options, file_format)
     capture = prepare(scene, options["seed"])
     _warn_of_cut_packets(capture)
-    try:
-        truth = _write(capture, out, file_format, options["bit_rate"])
-        _write_extras(capture, options)
-    except OSError as error:
-        raise outputs.unwritable(error.filename or out, error) from None
+    truth = _write(capture, out, file_format, options["bit_rate"])
+    _write_extras(capture, options)
     click.echo(f"{out} and {truth.name}: {_summary(capture)}", err=True)
 
 
@@ -137,7 +134,7 @@ def _scene(options: dict[str, Any], file_format: str) -> Scene:
         "exposure_slots": lambda slots: scene.metered(slots),
         "exposure_s": lambda seconds: replace(scene, exposure_s=seconds),
         "electrons": lambda electrons: replace(scene, light_e_per_s=electrons / scene.exposure_s),
-        "column_delays": lambda text: replace(scene, column_delay_slots=_delays(text, scene.screen.columns)),
+        "column_delays": lambda delays: replace(scene, column_delay_slots=_delays(delays, scene.screen.columns)),
         "scale": lambda scale: scene.scaled(scale, keep_readout=options["keep_readout"]),
     }
     for name, value in _given(options, changes).items():
@@ -178,28 +175,16 @@ def _with_pose(scene: Scene, options: dict[str, Any]) -> Scene:
     if pose.fill <= 0:
         raise UsageError(f"--fill must be positive (got {pose.fill})", "give a positive number")
     if options["corners"] is not None:
-        values = _numbers(options["corners"], "--corners", (8,))
+        values = options["corners"]
         pose = replace(pose, corners=tuple(zip(values[::2], values[1::2], strict=True)))
     is_turned = abs((pose.roll_deg + 180) % 360 - 180) > 90
     return replace(scene, pose=pose, orientation=3 if is_turned else scene.orientation)
 
 
-def _delays(text: str, n_columns: int) -> float | tuple[float, ...]:
-    delays = _numbers(text, "--column-delays", (1, n_columns))
-    return delays if len(delays) > 1 else delays[0]
-
-
-def _numbers(text: str, option: str, counts: tuple[int, ...]) -> tuple[float, ...]:
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = (nan,)
-    if not all(map(isfinite, values)):
-        raise UsageError(f"{option}: {text!r} is no list of numbers", "separate numbers by commas")
-    if len(values) not in counts:
-        wanted = " or ".join(str(count) for count in counts)
-        raise UsageError(f"{option} takes {wanted} numbers (got {len(values)})", "separate numbers by commas")
-    return values
+def _delays(delays: tuple[float, ...], n_columns: int) -> float | tuple[float, ...]:
+    n = len(delays)
+    refuse((n not in (1, n_columns), f"--column-delays takes 1 or {n_columns} numbers (got {n})", "give as many"))
+    return delays if n > 1 else delays[0]
 
 
 def _weights(text: str) -> Weights:
@@ -241,10 +226,10 @@ def _write_extras(capture: Recording, options: dict[str, Any]) -> None:
     if options["waveforms"] is not None:
         n_bursts = 1 + int(last.row_start_slots[-1] // capture.link.burst_slots)
         n_slots, folder = n_bursts * capture.link.burst_slots, options["waveforms"]
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / _SLOT_FILE).open("wb") as file:
-            WRITERS[".csv"](file, [capture.link.slots(0, n_slots).T], n_slots, capture.scene.screen)
-        export_picture(capture.drive, folder)
+        with outputs.writable(folder):
+            with (folder / _SLOT_FILE).open("wb") as file:
+                WRITERS[".csv"](file, [capture.link.slots(0, n_slots).T], n_slots, capture.scene.screen)
+            export_picture(capture.drive, folder)
 
 
 def _summary(capture: Recording) -> str:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from rxcli.errors import UsageError, failure_explained, shortened
-from rxcli.outputs import is_stream, replacing, unwritable
+from rxcli.outputs import is_stream, replacing, writable
 from rxcli.results.record import from_record, to_record
 from rxcli.types import FrameResult
 
@@ -119,13 +119,10 @@ class Journal:
 
     def _open(self) -> None:
         """Open and lock the file. One that it replaces stays locked, so that no other run goes on in that."""
-        try:
+        with writable(self._path):
             opener = None if is_stream(self._path) else _open_no_link
             self._file = self._open_files.enter_context(FileIO(self._path, "a", opener=opener))
-            self._regular = stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
-        except (OSError, ValueError) as error:
-            self.close()
-            raise unwritable(self._path, error) from None
+        self._regular = stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
         try:
             if self._regular and fcntl is not None:
                 fcntl.flock(self._file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -144,16 +141,15 @@ class Journal:
         """
         rest = memoryview(line.encode() + b"\n")
         whole = len(rest)
-        try:
-            while rest:
-                rest = rest[self._file.write(rest) :]
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            if self._regular and len(rest) < whole:
-                size = os.fstat(self._file.fileno()).st_size
-                self._file.truncate(size - (whole - len(rest)))
-            raise unwritable(self._path, error) from None
+        with writable(self._path):
+            try:
+                while rest:
+                    rest = rest[self._file.write(rest) :]
+            except OSError:
+                if self._regular and len(rest) < whole:
+                    size = os.fstat(self._file.fileno()).st_size
+                    self._file.truncate(size - (whole - len(rest)))
+                raise
 
     def recover(
         self, head: Head | None = None, paths: Mapping[str, str] | None = None

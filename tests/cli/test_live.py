@@ -19,7 +19,7 @@ from commands import ENVIRONMENT
 from fake_camera import FORMATS as FAKE_FORMATS
 from fake_camera import OTHERS, Bench
 
-from rxcli.cli.live import Status, format_status
+from rxcli.cli.following import Status, format_status
 from rxcli.cli.main import run
 from rxcli.errors import ExitCode, InputError
 from rxcli.ingest.v4l2 import CameraCounts, LiveSource
@@ -256,7 +256,7 @@ def test_packets_are_shown_until_a_file_has_come(
             objects = (file,) if frame.index == 2 else ()
             yield FrameResult(frame.source, frame.index, frame.time_s, "ok", columns=columns, objects=objects)
 
-    monkeypatch.setattr("rxcli.cli.live.receive", receive)
+    monkeypatch.setattr("rxcli.cli.following.receive", receive)
     bench.plug_in()
     assert run(["live", "/dev/video0", "--until-complete", "--out", str(tmp_path / "out")]) == ExitCode.OK
     assert (tmp_path / "out" / "a.txt").read_bytes() == b"sent"
@@ -297,7 +297,7 @@ class TestStatus:
     ) -> None:
         """The loss shows at once, with reason and next step."""
         clock = iter([10.0, 10.25, 10.5, 10.75, 11.0, 11.01])
-        monkeypatch.setattr("rxcli.cli.live.time.monotonic", lambda: next(clock))
+        monkeypatch.setattr("rxcli.cli.following.time.monotonic", lambda: next(clock))
         source = LiveSource(tmp_path)
         source.counts = CameraCounts(dropped=7, damaged=2)
         status = Status(source)
@@ -323,7 +323,8 @@ class TestStatus:
     def test_on_a_terminal_a_block_stays_in_place(self) -> None:
         """Three lines that are written over, payloads above them; not a line for every frame."""
         code = (
-            "import time; from dataclasses import replace; from pathlib import Path; from rxcli.cli.live import _show\n"
+            "import time; from dataclasses import replace; from pathlib import Path\n"
+            "from rxcli.cli.following import _show\n"
             "from test_live import result, LiveSource, Status\n"
             "with Status(LiveSource(Path('x'))) as status:\n"
             "    for _ in range(4):\n"

@@ -241,7 +241,6 @@ def test_command_writes_clips_through_real_encoders(tmp_path: Path, name: str, c
         (["a.jpg", "--payload", "hex:0g"], "even number of hex digits"),
         (["a.jpg", "--payload", "none.bin"], "cannot be read"),
         (["a.jpg", "--text", "a", "--slots", "s.csv"], "exclude each other"),
-        (["a.jpg", "--corners", "1,2,3"], "takes 8 numbers"),
         (["a.jpg", "--screen", "nope"], "no profile"),
         (["a.jpg", "--picture", "nope.png"], "no such picture"),
         (["a.dng", "--preset", "video-1080p"], "has none"),
