@@ -298,7 +298,7 @@ def tapped(path: Path, ours: re.Pattern[bytes], option: str) -> AbstractContextM
 
 @contextmanager
 def writable(what: object, step: str = "name a file in a folder that can be written") -> Iterator[None]:
-    """Raise what the system says of an output as an error of ours; of a pipe whose reader has gone, as it is.
+    """Raise the system's errors for an output as errors of ours; that of a pipe whose reader has gone as it is.
 
     Raises:
         UsageError: the output cannot be written.

@@ -4,8 +4,8 @@ An unknown key, a missing one or an impossible value is a `ProfileError` that na
 Times in seconds, lengths in pixels of the stored picture (integer coordinates are pixel centres).
 """
 
+import json
 import logging
-import os
 import re
 import tomllib
 from collections.abc import Iterable
@@ -254,26 +254,17 @@ def load_profile(name_or_path: str | Path, kind: type[Any] | None = None) -> Any
     if not isinstance(name_or_path, (str, Path)) or not name or not set(kinds) <= set(_KINDS):
         step = "give a name or a TOML file, and ScreenProfile or CameraProfile as the kind"
         raise UsageError(f"no profile is called {shortened(repr(name_or_path))} (of kind {kind})", step)
-    path = next((path for path in (_file_of(name, kind) for kind in kinds) if path != Path(name)), Path(name))
-    try:
-        text = read_limited(path, _MAX_BYTES).decode("utf-8")
-    except FileNotFoundError:
-        known = ", ".join(sorted({path.stem for kind in kinds for _, path in _profile_files(kind)}))
-        among = " and ".join(_KINDS[kind] for kind in kinds)
-        raise ProfileError(f"no profile {name!r} among {among}", f"name a TOML file or one of: {known}") from None
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ProfileError(f"{name}: cannot be read as a profile ({reason})", "name a TOML file") from None
+    named = (path for kind in kinds for _, path in _profile_files(kind) if path.stem == name)
+    path = next(named, Path(name)) if NAME.fullmatch(name) else Path(name)
+    with failure_explained(f"{name}: cannot be read as a profile", "name a TOML file", ProfileError):
+        try:
+            text = read_limited(path, _MAX_BYTES).decode("utf-8")
+        except FileNotFoundError:
+            known = ", ".join(sorted({path.stem for kind in kinds for _, path in _profile_files(kind)}))
+            among = " and ".join(_KINDS[kind] for kind in kinds)
+            raise ProfileError(f"no profile {name!r} among {among}", f"name a TOML file or one of: {known}") from None
     raw = _parsed(text, name)
     return check_profile(raw, kind or _kind_of(raw, name), name)
-
-
-def _file_of(name: str, kind: type[Any]) -> Path:
-    """File of the profile `name`, the user's first; otherwise `name` is a path."""
-    if NAME.fullmatch(name) is None:
-        return Path(name)
-    by_name = (folder / _KINDS[kind] / f"{name}.toml" for _, folder in profile_dirs())
-    return next((path for path in by_name if os.path.isfile(path)), Path(name))
 
 
 def _profile_files(kind: type[Any]) -> list[tuple[str, Path]]:
@@ -313,18 +304,13 @@ def usual_screens() -> tuple[ScreenProfile, ...]:
 
 
 def dump_profile(profile: ScreenProfile | CameraProfile) -> str:
-    """Write the profile as TOML text for `parse_profile`."""
+    """Write the profile as TOML text, which knows no null: what is unknown is left out."""
     import tomli_w
 
-    return tomli_w.dumps(_without_none(msgspec.to_builtins(profile)))
+    def known(table: dict[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in table.items() if value is not None}
 
-
-def _without_none(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_none(item) for key, item in value.items() if item is not None}
-    if isinstance(value, (list, tuple)):
-        return [_without_none(item) for item in value]
-    return value
+    return tomli_w.dumps(json.loads(msgspec.json.encode(profile), object_hook=known))
 
 
 def match_camera(

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from html import escape
-from typing import Any, Literal, Protocol, Self
+from typing import Any, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
+_T = TypeVar("_T", bound="RowProfiles | SlotSamples")
 #: Is given the arrays at the stage boundaries of a received frame: source, number of the frame, stage -> array or
 #: dataclass of arrays.
 OnTaps = Callable[[str, int, dict[str, Any]], object]
@@ -209,15 +210,13 @@ class RowProfiles:
 
     def of_columns(self, columns: IntArray | slice) -> Self:
         """The profiles of some columns."""
-        rows = self.sensor_row
-        return replace(
-            self,
-            light=self.light[columns],
-            inside=self.inside[columns],
-            sensor_row=None if rows is None else rows[columns],
-            count=self.count[columns],
-            level=None if self.level is None else self.level[columns],
-        )
+        return _with_columns(self, columns, "light", "inside", "sensor_row", "count", "level")
+
+
+def _with_columns(value: _T, columns: IntArray | slice, *names: str) -> _T:
+    """A dataclass with some columns of its named arrays, where they are known."""
+    arrays = {name: array for name in names if (array := getattr(value, name)) is not None}
+    return replace(value, **{name: array[columns] for name, array in arrays.items()})
 
 
 @dataclass(frozen=True, slots=True)
@@ -294,8 +293,7 @@ class SlotSamples:
 
     def of_columns(self, columns: IntArray) -> Self:
         """The samples of some columns."""
-        level = None if self.level is None else self.level[columns]
-        return replace(self, light=self.light[columns], valid=self.valid[columns], level=level)
+        return _with_columns(self, columns, "light", "valid", "level")
 
 
 @dataclass(frozen=True, slots=True)

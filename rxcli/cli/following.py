@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import click
-from tqdm import tqdm
 
 from rxcli.cli.common import output, receiver_options
 from rxcli.cli.printing import is_terminal, print_line, print_text
@@ -95,6 +94,8 @@ def _show(result: FrameResult) -> None:
     """Print to stdout, above the block of the status where one stays on the terminal."""
     lines = [*format_link(result), *([format_frame(result)] if result.packets else [])]
     if lines:
+        from tqdm import tqdm
+
         with tqdm.external_write_mode():
             print_text("\n".join(lines))
 
@@ -158,6 +159,8 @@ class Status:
         if not is_terminal(sys.stderr):
             _say(" | ".join(filter(None, lines)))
             return
+        from tqdm import tqdm
+
         lines = wrapped("\n".join(lines), max(shutil.get_terminal_size().columns - 1, 20)).split("\n")
         form = {"bar_format": "{desc}", "dynamic_ncols": True, "leave": True, "file": sys.stderr}
         while len(self._bars) < len(lines):

@@ -15,7 +15,7 @@ from rxcli.ingest import open_source
 from rxcli.options import ReceiverOptions
 from rxcli.outputs import Output, claim, claim_own_folder, write_whole
 from rxcli.receiver.receive import receive
-from rxcli.results.cameras import camera_of, screen_of
+from rxcli.results.cameras import Reception
 from rxcli.results.dump import plain_name
 from rxcli.results.inspection import inspect_frame
 from rxcli.results.page import MARK, inspection_page
@@ -91,14 +91,14 @@ def write_page(
         InputError: the source cannot be read, or has no such frame.
     """
     results, picture, taps = _received(path, frame, options, truth)
-    shown = next(result for result in results if result.frame == picture.index)
-    screen, camera = screen_of(shown, options.screens), camera_of(picture, shown, options.cameras)
-    known = inspect_frame(taps, shown) if taps and shown.columns else None
-    text = inspection_page(picture, shown, screen, camera, known, results if len(results) > 1 else [])
+    result = next(result for result in results if result.frame == picture.index)
+    shown = Reception.of(picture, result, options)
+    known = inspect_frame(taps, result) if taps and result.columns else None
+    text = inspection_page(shown, known, results if len(results) > 1 else [])
     claim_own_folder("--out", page.parent, (page.name,), force)
     write_whole(page, text)
-    quality = qualities(known, 1 / screen.slot_rate_hz) if known and screen else []
-    write_json({"source": path, "frame": shown.frame, "quality": [plain(asdict(each)) for each in quality]}, json_path)
+    quality = qualities(known, 1 / shown.screen.slot_rate_hz) if known and shown.screen else []
+    write_json({"source": path, "frame": result.frame, "quality": [plain(asdict(each)) for each in quality]}, json_path)
     return results
 
 

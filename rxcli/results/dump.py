@@ -5,15 +5,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from rxcli.errors import failure_explained
 from rxcli.outputs import TAPS, tapped
 from rxcli.types import BurstPosteriors, Clock, Float32Array, FloatArray, OnTaps, RowProfiles, SlotSamples
-
-_Stage = TypeVar("_Stage", RowProfiles, Clock, SlotSamples, BurstPosteriors)
 
 #: Longer names, of the 255 bytes that file systems take, are cut where something is appended.
 MAX_NAME_BYTES = 200
@@ -49,19 +47,17 @@ def read_taps(path: str | Path) -> Taps:
     with failure_explained(f"{path}: not the taps of a photograph", "write them with --dump-dir"):
         with np.load(path) as file:
             arrays = dict(file)
-        return Taps(
-            arrays["geometry.corners"],
-            arrays["geometry.sampled_corners"],
-            _stage(arrays, "sampling", RowProfiles),
-            _stage(arrays, "clock", Clock),
-            _stage(arrays, "samples", SlotSamples),
-            arrays["channel.initial_llr"],
-            arrays["channel.llr"],
-            _stage(arrays, "detect", BurstPosteriors),
-        )
+        kinds = {"sampling": RowProfiles, "clock": Clock, "samples": SlotSamples, "detect": BurstPosteriors}
+        return taps_of(arrays | {name: _stage(arrays, name, kind) for name, kind in kinds.items()})
 
 
-def _stage(arrays: Mapping[str, Any], name: str, kind: type[_Stage]) -> _Stage:
+def taps_of(stages: Mapping[str, Any]) -> Taps:
+    """The arrays that a photograph's reception hands to its callback."""
+    names = ("geometry.corners", "geometry.sampled_corners", "sampling", "clock", "samples")
+    return Taps(*(stages[name] for name in (*names, "channel.initial_llr", "channel.llr", "detect")))
+
+
+def _stage(arrays: Mapping[str, Any], name: str, kind: type[Any]) -> Any:
     """One stage's dataclass; what was None was left out."""
     found: dict[str, Any] = {item.name: arrays.get(f"{name}.{item.name}") for item in fields(kind)}
     scalars = {key: value.item() for key, value in found.items() if value is not None and not value.ndim}

@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.profiles import CameraProfile, ScreenProfile
-from rxcli.receiver.plane.orientation import as_received
+from rxcli.results.cameras import Reception
 from rxcli.results.overlay import drawing, outlines_of
-from rxcli.types import Frame, FrameResult
+from rxcli.types import Frame
 
 #: Width of a map, pixels, and points along a border.
 _WIDTH, _POINTS = 640, 13
@@ -16,36 +15,27 @@ _QUALITY = 85
 _LOW, _RANGE = 20, 215
 
 
-def column_map(
-    frame: Frame, result: FrameResult, screen: ScreenProfile | None, camera: CameraProfile | None
-) -> dict[str, Any] | None:
-    """Coherent strips, with the columns of the screen that was found; None for tiny pictures.
-
-    Args:
-        frame: the picture.
-        result: what became of it.
-        screen: the profile that `result` names.
-        camera: the profile that `result` names, or the estimated one.
-    """
+def column_map(shown: Reception) -> dict[str, Any] | None:
+    """Coherent strips, with the columns of the screen that was found; None for tiny pictures."""
     from rxcli.receiver.plane.read import read_plane
     from rxcli.receiver.screen.find import MIN_SIZE_PX
     from rxcli.receiver.screen.strips import read_strips
 
-    frame, result = as_received(frame, result)
+    turned = shown.turned
+    frame, corners = turned.frame, turned.result.corners
     if min(frame.width, frame.height) < MIN_SIZE_PX:
         return None
-    grids = []
-    if result.corners is not None and screen is not None:
-        pitch_px = float(np.linalg.norm(result.corners[1] - result.corners[0])) / screen.columns
-        outlines = outlines_of(result.corners, screen.columns, frame, camera)
-        shown = np.linspace(0, outlines.rows.size - 1, _POINTS).astype(int)
+    grids, outlines = [], outlines_of(turned)
+    if outlines is not None and corners is not None:
+        pitch_px = float(np.linalg.norm(corners[1] - corners[0])) / (len(outlines.edges_x) - 1)
+        places = np.linspace(0, outlines.rows.size - 1, _POINTS).astype(int)
         scale = _WIDTH / frame.width
-        lines = [(np.column_stack([x[shown], outlines.rows[shown]]) * scale).round(1) for x in outlines.edges_x]
+        lines = [(np.column_stack([x[places], outlines.rows[places]]) * scale).round(1) for x in outlines.edges_x]
         grids = [{"pitch_px": pitch_px, "lines": lines}]
     return {
         "title": "Where the columns may be",
         "text": "No grid of columns stands out: no strips of pixels change together."
-        if result.corners is None
+        if corners is None
         else "The screen was found.",
         "caption": "Bright: neighbouring strips of pixels change together from row to row, as they do in front of a "
         "backlight however dark the picture is. Lines: borders of columns, across which they do not.",

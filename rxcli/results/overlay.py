@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.profiles import CameraProfile, ScreenProfile
-from rxcli.receiver.plane.orientation import as_received, turned_points
+from rxcli.receiver.plane.orientation import turned_points
 from rxcli.receiver.screen import geometry
+from rxcli.results.cameras import Reception
 from rxcli.results.undistort import grey_levels
-from rxcli.types import FloatArray, Frame, FrameResult, Outlines
+from rxcli.types import Frame, Outlines
 
 #: Points on each side of an outline: a bent side looks smooth.
 _POINTS = 17
@@ -53,46 +53,31 @@ def preview(frame: Frame, width_px: int = 1000) -> Preview:
     return Preview(grey_levels(frame, step), step)
 
 
-def outlines_of(corners: FloatArray, n_columns: int, frame: Frame, camera: CameraProfile | None) -> Outlines:
-    """Outlines of the columns of a screen, along the bends of a lens that is known or estimated."""
+def outlines_of(turned: Reception) -> Outlines | None:
+    """Outlines of the columns of a screen, along the bends of a lens that is known; None where no screen was found.
+
+    Args:
+        turned: a frame turned as it was received.
+    """
+    frame, camera, corners = turned.frame, turned.camera, turned.result.corners
+    if corners is None or turned.screen is None:
+        return None
     lens = geometry.lens_for(camera.lens, frame.width, frame.height) if camera and camera.lens else None
-    return geometry.column_outlines(corners, n_columns, 1, frame.width, frame.height, lens)
+    return geometry.column_outlines(corners, turned.screen.columns, 1, frame.width, frame.height, lens)
 
 
-def column_polygons(
-    result: FrameResult, frame: Frame, screen: ScreenProfile | None, camera: CameraProfile | None
-) -> list[tuple[int, str, FloatArray]]:
-    """Number, status and outline (n, 2), in pixels of the frame, of every column; none where no screen was found."""
-    if result.corners is None or screen is None or not result.columns:
-        return []
-    frame, received = as_received(frame, result)
-    assert received.corners is not None
-    outlines = outlines_of(received.corners, screen.columns, frame, camera)
-    found: list[tuple[int, str, FloatArray]] = []
+def picture_of(shown: Reception, small: Preview, quality: int = 80) -> dict[str, Any]:
+    """The small copy of a frame as JPEG, with the screen's and its columns' outlines in its pixels, as plain data."""
+    result, turned, found = shown.result, shown.turned, list[dict[str, Any]]()
+    outlines = outlines_of(turned)
     for column in result.columns:
-        on_screen = np.flatnonzero(outlines.inside[column.column].any(axis=0))
-        if not on_screen.size:
+        if outlines is None or not (on_screen := np.flatnonzero(outlines.inside[column.column].any(axis=0))).size:
             continue
         chosen = on_screen[np.linspace(0, on_screen.size - 1, min(_POINTS, on_screen.size)).astype(int)]
         rows = outlines.rows[chosen].astype(np.float64)
         left, right = (outlines.edges_x[column.column + side, chosen].astype(np.float64) for side in (0, 1))
         sides = np.concatenate([np.column_stack([left, rows]), np.column_stack([right, rows])[::-1]])
-        found.append((column.column, column.status, turned_points(sides, frame, -result.quarter_turns % 4)))
-    return found
-
-
-def picture_of(
-    result: FrameResult,
-    frame: Frame,
-    small: Preview,
-    screen: ScreenProfile | None,
-    camera: CameraProfile | None,
-    quality: int = 80,
-) -> dict[str, Any]:
-    """The small copy of a frame as JPEG, with the screen's and its columns' outlines in its pixels, as plain data."""
+        points = turned_points(sides, turned.frame, -result.quarter_turns % 4) / small.step
+        found.append({"column": column.column, "status": column.status, "points": points.round(1).tolist()})
     corners = [] if result.corners is None else (result.corners / small.step).round(1).tolist()
-    outlines = [
-        {"column": number, "status": status, "points": (points / small.step).round(1).tolist()}
-        for number, status, points in column_polygons(result, frame, screen, camera)
-    ]
-    return drawing(small.pixels, quality, corners, outlines)
+    return drawing(small.pixels, quality, corners, found)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from rxcli.errors import capitalised, printable
-from rxcli.profiles import CameraProfile, ScreenProfile
 from rxcli.resources import data_dir, filled_page
 from rxcli.results.aim import brightness_of, height_share, split_message
+from rxcli.results.cameras import Reception
 from rxcli.results.columns import column_rows, packet_rows, text_rows
 from rxcli.results.inspection import Inspection, Trace
 from rxcli.results.maps import column_map
@@ -31,24 +31,15 @@ _POINTS, _FEW_POINTS, _MANY_COLUMNS, _STEPS, _WIDTH_PX = 1200, 500, 24, 1000, 12
 _TOP = 0.995
 
 
-def inspection_page(
-    frame: Frame,
-    result: FrameResult,
-    screen: ScreenProfile | None,
-    camera: CameraProfile | None,
-    known: Inspection | None,
-    timeline: Sequence[FrameResult] = (),
-) -> str:
+def inspection_page(shown: Reception, known: Inspection | None, timeline: Sequence[FrameResult] = ()) -> str:
     """The page of a frame.
 
     Args:
-        frame: the picture.
-        result: what became of it.
-        screen: the profile that `result` names.
-        camera: the profile that `result` names, or the estimated one.
+        shown: the frame and what became of it.
         known: its light and slots; None where reception ended before.
         timeline: results of all frames of the clip that it is of.
     """
+    frame, result, screen = shown.frame, shown.result, shown.screen
     reason, advice = split_message(result) if result.message else ("", "")
     title, frame_note = headline(result), ""
     if timeline:  # a clip is headed by what all its frames gave
@@ -63,8 +54,8 @@ def inspection_page(
         "advice": advice,
         "texts": [row for entry in timeline or [result] for row in text_rows(entry)],
         "facts": _facts(frame, result),
-        "picture": picture_of(result, frame, preview(frame, _WIDTH_PX), screen, camera),
-        "maps": [shown for shown in (column_map(frame, result, screen, camera),) if shown],
+        "picture": picture_of(shown, preview(frame, _WIDTH_PX)),
+        "maps": [drawn for drawn in (column_map(shown),) if drawn],
         "timeline": [
             [entry.frame, entry.time_s, headline(entry), len(entry.packets), entry.status in ("ok", "partial")]
             for entry in timeline

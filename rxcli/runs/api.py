@@ -7,7 +7,6 @@ from dataclasses import replace
 from difflib import get_close_matches
 from inspect import signature
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from rxcli.ingest import open_source
 from rxcli.options import check_values, is_number, receiver_options
 from rxcli.receiver.receive import receive as receive_frames
 from rxcli.receiver.receive import receive_frame
-from rxcli.results.dump import Taps, read_taps, taps_writer
+from rxcli.results.dump import Taps, taps_of, taps_writer
 from rxcli.runs.batch import Decoder
 from rxcli.types import Frame, FrameResult, Metadata, Mosaic
 
@@ -97,12 +96,10 @@ class Receiver:
             InputError: the file cannot be read.
             UsageError: the file is a clip, or the array is no picture.
         """
-        frame = _frame_of(picture)
-        with TemporaryDirectory(prefix="vlc-rx-") as folder:
-            on_taps = taps_writer(Path(folder))
-            (result,) = self._with_messages(iter([receive_frame(frame, self.options, on_taps)]))
-            written = next(Path(folder).iterdir(), None)
-            return result, None if written is None else read_taps(written)
+        stages: dict[str, Any] = {}
+        received = receive_frame(_frame_of(picture), self.options, lambda _source, _frame, of: stages.update(of))
+        (result,) = self._with_messages(iter([received]))
+        return result, taps_of(stages) if stages else None
 
 
 def decode(picture: Picture, **options: Any) -> FrameResult:

@@ -9,8 +9,8 @@ import time
 import warnings
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
+from functools import lru_cache, partial
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -25,7 +25,7 @@ from rxcli.profiles import CameraProfile
 from rxcli.resources import data_dir
 from rxcli.results import report
 from rxcli.results.aim import split_message
-from rxcli.results.cameras import camera_of, estimated_camera, screen_of
+from rxcli.results.cameras import Reception, estimated_camera
 from rxcli.results.columns import column_rows, packet_rows, text_rows
 from rxcli.results.overlay import Preview, picture_of, preview
 from rxcli.results.record import to_record
@@ -54,26 +54,17 @@ _WIDTH_PX, _MAX_PREVIEWS = 1000, 40
 _ADDRESS_SPACE = 6 << 30
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """Limits for decoding one picture."""
-
-    time_s: float = 45.0
-    #: Resident memory of the process.
-    resident_bytes: int = 1 << 30
-
-
 class DecodingProcess:
     """A process that decodes one file after the other; not for several threads at once.
 
     Args:
         options: of the receiver.
-        limits: beyond which it is ended and replaced.
+        max_s: for one picture, beyond which it is ended and replaced.
+        max_bytes: likewise, its resident memory.
     """
 
-    def __init__(self, options: ReceiverOptions, limits: Limits | None = None) -> None:
-        self._options = options
-        self._limits = limits or Limits()
+    def __init__(self, options: ReceiverOptions, max_s: float = 45.0, max_bytes: int = 1 << 30) -> None:
+        self._options, self._max_s, self._max_bytes = options, max_s, max_bytes
         self._process: BaseProcess | None = None
         self._connection: Connection | None = None
 
@@ -123,13 +114,13 @@ class DecodingProcess:
 
     def _answer(self, publish: Callable[[dict[str, Any]], None] | None) -> dict[str, Any]:
         assert self._connection is not None
-        end_s, n_partial_bytes = time.monotonic() + self._limits.time_s, 0
+        end_s, n_partial_bytes = time.monotonic() + self._max_s, 0
         while True:
             while not self._connection.poll(_POLL_S):
                 if time.monotonic() > end_s:
-                    reason = f"nothing was found in {self._limits.time_s:.0f} s, after which the page gives up"
+                    reason = f"nothing was found in {self._max_s:.0f} s, after which the page gives up"
                     raise _EndedError(reason, "photograph the screen from nearer, or decode the file by `vlc-rx`")
-                if resident_bytes(self.pid) > self._limits.resident_bytes:
+                if resident_bytes(self.pid) > self._max_bytes:
                     raise _EndedError("it takes too much memory", "try a smaller picture")
             answer, n_bytes = receive(self._connection)
             if not answer.get("partial"):
@@ -178,23 +169,18 @@ def _work(connection: Connection, options: ReceiverOptions) -> None:
         signal.signal(number, signal.SIG_IGN)
     _confine()
     _warm_up(options)
-    sessions: dict[str, PhotoCollector] = {}
+    photos_of = _by_session(options)
     with suppress(EOFError, OSError):
         while True:
             path, name, session = connection.recv()
-            photos = _photos_of(session, sessions, options)
+            photos = photos_of(session) if session else None
             send(connection, answer_for(Path(path), name, options, partial(send, connection), photos))
 
 
-def _photos_of(session: str, sessions: dict[str, PhotoCollector], options: ReceiverOptions) -> PhotoCollector | None:
-    """Combined photos of a session so far, or None without a session."""
-    if not session:
-        return None
-    known = sessions.pop(session, None)
-    sessions[session] = known or PhotoCollector(options.screens, min(options.file_memory_mb, _SESSION_MB))
-    if len(sessions) > _SESSIONS:
-        del sessions[next(iter(sessions))]  # the one whose last photo is the oldest
-    return sessions[session]
+def _by_session(options: ReceiverOptions) -> Callable[[str], PhotoCollector]:
+    """Gives the combined photos of a session so far; sessions whose last photo is the oldest are forgotten."""
+    memory_mb = min(options.file_memory_mb, _SESSION_MB)
+    return lru_cache(_SESSIONS)(lambda _session: PhotoCollector(options.screens, memory_mb))
 
 
 def _confine() -> None:
@@ -310,8 +296,7 @@ class Previews:
         small = self._previews.get(result.frame)
         if small is None or self.frame is None:
             return None
-        camera = camera_of(self.frame, result, options.cameras)
-        return picture_of(result, self.frame, small, screen_of(result, options.screens), camera, self._quality)
+        return picture_of(Reception.of(self.frame, result, options), small, self._quality)
 
 
 class _Gathered(Previews):

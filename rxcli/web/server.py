@@ -33,7 +33,7 @@ from rxcli.ingest.v4l2 import CameraSettings
 from rxcli.options import ReceiverOptions
 from rxcli.outputs import claim_folder
 from rxcli.resources import data_dir, filled_page
-from rxcli.web.decoding import DecodingProcess, Limits, refusal
+from rxcli.web.decoding import DecodingProcess, refusal
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +99,6 @@ class Bounds:
     connections: int = 64
     #: Time after which an idle connection is closed.
     idle_s: float = 15.0
-    decoding: Limits = field(default_factory=Limits)
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +193,7 @@ class Server:
 
     def __init__(self, site: Site) -> None:
         self._site = site
-        self._decoder = DecodingProcess(site.options, site.bounds.decoding)
+        self._decoder = DecodingProcess(site.options)
         self._thread = ThreadPoolExecutor(1, "decode")
         self._arriving: list[_Upload] = []
         #: Visitors and callbacks of waiting pictures, in the order of decoding; each receives its place in the queue.

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rxcli.profiles import ScreenProfile, load_profile
+from rxcli.results.cameras import Reception
 from rxcli.results.maps import column_map
 from rxcli.types import Frame, FrameResult
 
@@ -29,8 +30,9 @@ def test_borders_of_the_columns_are_drawn_where_a_screen_was_found() -> None:
         np.array([[50, 0], [950, 0], [950, 1199], [50, 1199.0]]),
     )
     frame, nothing = Frame(drawn(40.0), "drawn"), FrameResult("drawn", 0, 0.0, "no_screen")
-    shown = column_map(frame, replace(nothing, status="ok", corners=corners), screen, None)
-    missing = column_map(frame, nothing, None, None)
+    shown = column_map(Reception(frame, replace(nothing, status="ok", corners=corners), screen, None))
+    missing = column_map(Reception(frame, nothing, None, None))
+    tiny = Frame(np.zeros((64, 400), np.uint8), "tiny")
     [grid] = shown["grids"]
     assert len(grid["lines"]) == 21
     assert grid["pitch_px"] == pytest.approx(45)
@@ -38,4 +40,4 @@ def test_borders_of_the_columns_are_drawn_where_a_screen_was_found() -> None:
     assert missing["grids"] == []
     assert "No grid of columns stands out" in missing["text"]
     assert shown["jpeg"] == missing["jpeg"]
-    assert column_map(Frame(np.zeros((64, 400), np.uint8), "tiny"), nothing, None, None) is None
+    assert column_map(Reception(tiny, nothing, None, None)) is None

@@ -16,7 +16,6 @@ import tempfile
 import threading
 import time
 import zlib
-from collections import OrderedDict
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -46,7 +45,7 @@ from rxcli.profiles import ScreenProfile, load_profile
 from rxcli.results.columns import text_rows
 from rxcli.runs.processes import resident_bytes
 from rxcli.types import ColumnResult, FrameResult, FrameSoftBits, Message, PacketResult, ReceivedObject
-from rxcli.web.decoding import DecodingProcess, Limits, _photos_of, answer_for
+from rxcli.web.decoding import DecodingProcess, _by_session, answer_for
 from rxcli.web.live import live_events
 from rxcli.web.server import Bounds, Server, Site, own_addresses
 
@@ -149,21 +148,21 @@ def test_photos_of_a_session_add_up(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         yield replace(result_of("partial", packets=1), screen_profile=screen.name, soft_bits=soft)
 
     monkeypatch.setattr("rxcli.runs.batch.Decoder.results", results)
-    sessions: OrderedDict[str, Any] = OrderedDict()
+    photos_of: Any = _by_session(options)
 
     def texts(session: str) -> list[str]:
-        photos = _photos_of(session, sessions, options)
-        answer = answer_for(tmp_path / "a.jpg", "a", options, photos=photos)
+        answer = answer_for(tmp_path / "a.jpg", "a", options, photos=photos_of(session) if session else None)
         return [item["text"] for item in answer["texts"]]
 
     came = [texts("mine") for _ in range(12)]
     assert came[0] == []
     assert [text for photo in came for text in photo] == ["z" * 150]
     assert texts("another") == texts("") == []
+    mine = photos_of("mine")
     for number in range(20):
         texts(str(number))
-    assert len(sessions) == 8  # the latest
-    assert "mine" not in sessions
+    assert photos_of.cache_info().currsize == 8  # the latest
+    assert photos_of("mine") is not mine
 
 
 def test_a_photo_that_gives_its_text_without_a_packet_is_no_failure(
@@ -488,10 +487,10 @@ def test_the_decoding_process_may_die_hang_and_swell(tmp_path: Path, options: Re
         time.sleep(0.2)
         assert decoder.decode(tmp_path / "a.png", "a")["status"] == "ok"
     for limits, told in (
-        (Limits(time_s=0.0), "Nothing was found in 0 s, after which the page gives up."),
-        (Limits(resident_bytes=0), "It takes too much memory."),
+        ({"max_s": 0.0}, "Nothing was found in 0 s, after which the page gives up."),
+        ({"max_bytes": 0}, "It takes too much memory."),
     ):
-        with contextlib.closing(DecodingProcess(options, limits)) as decoder:
+        with contextlib.closing(DecodingProcess(options, **limits)) as decoder:
             assert decoder.decode(tmp_path / "a.png", "a")["reason"] == told
             assert decoder.pid is None
 
