@@ -16,9 +16,6 @@ from rxcli.receiver.camera.strips import ColumnStrips, joined
 from rxcli.receiver.light import LONG_EXPOSURE_SLOTS, SlotLight, column_light
 from rxcli.types import Clock, Float32Array, FloatArray, IntArray
 
-#: Rows over which the bend is straight: of a block of the normal equations.
-_BLOCK_ROWS = 16
-
 
 def settle(
     strips: ColumnStrips,
@@ -109,19 +106,12 @@ class _Model:
         self._window = max(round(SETTINGS.picture_slots * rows_per_slot / strips.pitch), 1)
         self._inside = np.maximum(local_mean(strips.inside, self._window), np.float32(1 / self._window))
         self._mean = self._local(strips.light)
-        n = strips.rows.size
-        #: Rows at the borders of blocks, and the bend terms (4, M, blocks + 1) there.
-        self._nodes = np.minimum(np.arange(-(-n // _BLOCK_ROWS) + 1) * _BLOCK_ROWS, n - 1)
-        self._terms = curvature_terms(strips.x[:, self._nodes], strips.rows[self._nodes], strips.width, strips.height)
+        self._terms = curvature_terms(strips.x, strips.rows, strips.width, strips.height)
 
     def times(self, values: FloatArray) -> Float32Array:
-        """(M, R) slot position of every strip's row; the bend is interpolated between the blocks' borders."""
-        n, (start, rows_per_slot) = self.strips.rows.size, values[:2]
-        straight = ((self.strips.rows - start) / rows_per_slot).astype(np.float32)
-        moved = (np.tensordot(values[2:], self._terms, 1) / rows_per_slot).astype(np.float32)[..., None]
-        along = np.arange(_BLOCK_ROWS) / np.maximum(np.diff(self._nodes), 1)[:, None]
-        bent: Float32Array = moved[:, :-1] + np.diff(moved, axis=1) * along.astype(np.float32)
-        return np.asarray(bent.reshape(len(bent), -1)[:, :n] + straight, np.float32)
+        """(M, R) slot position of every strip's row."""
+        bent = self.strips.rows - values[0] + np.tensordot(values[2:], self._terms, 1)
+        return np.asarray(bent / values[1], np.float32)
 
     def exposure(self, values: FloatArray, exposure_slots: float) -> tuple[float, float]:
         """The exposure near one that leaves least, and its standard deviation, slots."""
@@ -144,7 +134,7 @@ class _Model:
             step, covariance = self._step(values, times, near, slope, free)
             values = values + step
             before, times = times, self.times(values)
-            if float(np.abs(times - before)[:, ::_BLOCK_ROWS].max()) < SETTINGS.converged_slots:
+            if float(np.abs(times - before).max()) < SETTINGS.converged_slots:
                 break
         return values, covariance, near
 
@@ -168,19 +158,13 @@ class _Model:
     ) -> tuple[FloatArray, FloatArray]:
         """Step (6,) of the row-time map and its covariance, by what the columns differ in."""
         power = near.gain * slope
-        blocks = np.arange(0, self.strips.rows.size, _BLOCK_ROWS)
-        information = np.add.reduceat(near.weight * power * power, blocks, axis=1).astype(np.float64)
-        pull = np.add.reduceat(near.weight * power * near.residual, blocks, axis=1).astype(np.float64)
-        middle = np.minimum(blocks + _BLOCK_ROWS // 2, times.shape[1] - 1)
-        of_curvature = (self._terms[:, :, :-1] + self._terms[:, :, 1:]) / 2
-        jacobian = (
-            np.concatenate([np.full((1, *pull.shape), -1.0), -times[None, :, middle], of_curvature])[free] / values[1]
-        )
+        pull, information = near.weight * power * near.residual, (near.weight * power * power).ravel()
+        jacobian = np.concatenate([np.full((1, *times.shape), -1.0), -times[None], self._terms])[free] / values[1]
         flat = jacobian.reshape(free.size, -1)
         prior = np.zeros((values.size, values.size))
         prior[2:, 2:] = SETTINGS.samples_per_independent * LENS_PRECISION
         prior = prior[np.ix_(free, free)]
-        inverse = np.linalg.inv((flat * information.ravel()) @ flat.T + prior + TINY * np.eye(free.size))
+        inverse = np.linalg.inv((flat * information) @ flat.T + prior + TINY * np.eye(free.size))
         step = np.zeros_like(values)
         step[free] = inverse @ (flat @ pull.ravel() - prior @ values[free])
         n_columns = self.strips.n_columns
