@@ -296,11 +296,7 @@ class SlotLight:
 
     def mean_over(self, positions: FloatArray | Float32Array, exposure_slots: float) -> Float32Array:
         """(C, R) mean over exposures centred at positions (C, R), or common ones (1, R), in slots."""
-        late, _ = self._until(positions + np.float32(exposure_slots / 2))
-        early, _ = self._until(positions - np.float32(exposure_slots / 2))
-        late -= early
-        late *= np.float32(1 / exposure_slots)
-        return late
+        return self.mean_and_slope(positions, exposure_slots)[0]
 
     def mean_and_slope(
         self, positions: FloatArray | Float32Array, exposure_slots: float

@@ -8,9 +8,9 @@ A mosaic is read without demosaicing: each row's pixels are weighted so that eve
 green and blue, in cells of whole periods of its colours.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,24 +20,25 @@ from rxcli.types import Float32Array, Frame, LightPlane, Mosaic
 #: Minimum number of cells of a row, several for every strip of a hundred columns; and of a picture rotated by 90
 #: degrees, which is searched for wide columns only.
 _MIN_CELLS, _TURNED_CELLS = 1500, 400
-#: Bits of the largest word of two lanes.
-_LARGEST_WORD = 64
+#: Bytes of a word that holds any sum.
+_MAX_BYTES = 4
 #: Rows read at a time, chosen to fit the processor's cache.
 BAND_ROWS = 64
 
 
 def read_plane(frame: Frame) -> LightPlane:
     """Read every pixel of a frame."""
-    if frame.mosaic is not None:
-        return _read_mosaic(frame, frame.mosaic)
+    mix = None if frame.mosaic is None else _ColourMix.of(frame.mosaic)
     height, width = frame.pixels.shape
-    cell_px = _cell_px(width, 1)
+    cell_px = _cell_px(width, 1 if mix is None else mix.weights.shape[1])
     n_cells = width // cell_px
     sums = np.zeros((n_cells + 1, height), np.float32)
     for top in range(0, height, BAND_ROWS):
         band = frame.pixels[top : top + BAND_ROWS, : n_cells * cell_px]
-        sums[1:, top : top + BAND_ROWS] = cells_of(band, cell_px).T
-    return LightPlane(running_sums(sums), cell_px, width, frame.black, frame.white, is_linear=frame.linear)
+        sums[1:, top : top + BAND_ROWS] = (cells_of(band, cell_px) if mix is None else mix.cells(band, cell_px, top)).T
+    if mix is None:
+        return LightPlane(running_sums(sums), cell_px, width, frame.black, frame.white, is_linear=frame.linear)
+    return LightPlane(running_sums(mix.evened(sums)), cell_px, width, 0.0, 1.0, is_linear=True)
 
 
 def turned(plane: LightPlane) -> LightPlane:
@@ -71,54 +72,52 @@ def running_sums(sums: Float32Array) -> Float32Array:
 
 
 def cells_of(band: NDArray[Any], cell_px: int) -> NDArray[Any]:
-    """Sums (rows, n) of `cell_px` neighbouring integers; `cell_px` is a power of two, and two lanes share a word."""
-    if band.strides[1] != band.itemsize:  # Pixels do not lie side by side.
-        band = np.ascontiguousarray(band)
+    """Sums (rows, n) of `cell_px` neighbouring integers; `cell_px` is a power of two."""
     while cell_px > 1:
-        half = 8 * band.dtype.itemsize
-        if half == _LARGEST_WORD:
-            return np.asarray(band.reshape(len(band), -1, cell_px).sum(axis=2))
-        pairs = band.view(f"u{2 * band.dtype.itemsize}")
-        band = pairs >> pairs.dtype.type(half)
-        band += pairs & pairs.dtype.type((1 << half) - 1)
+        wider = np.dtype(f"u{min(2 * band.dtype.itemsize, _MAX_BYTES)}")
+        band = np.add(band[:, ::2], band[:, 1::2], dtype=wider)
         cell_px //= 2
     return band
 
 
-def _read_mosaic(frame: Frame, mosaic: Mosaic) -> LightPlane:
-    import cv2
-
-    height, width = frame.pixels.shape
-    weights, offsets, is_complete = _mosaic_weights(mosaic)
-    period, n_colours = weights.shape
-    cell_px = _cell_px(width, n_colours)
-    weights = np.tile(weights, (1, cell_px // n_colours))
-    n_cells = width // cell_px
-    sums = np.zeros((n_cells + 1, height), np.float32)
-    for top in range(0, height, BAND_ROWS):
-        band = frame.pixels[top : top + BAND_ROWS, : n_cells * cell_px].astype(np.float32)
-        phase = np.arange(top, top + len(band)) % period
-        cells = (band.reshape(len(band), n_cells, cell_px) @ weights[phase, :, None])[:, :, 0]
-        sums[1:, top : top + BAND_ROWS] = (cells - offsets[phase, None] * np.float32(cell_px)).T
-    if not is_complete:
-        sums = np.asarray(cv2.filter2D(sums, -1, np.array([[0.25, 0.5, 0.25]], np.float32)))
-    return LightPlane(running_sums(sums), cell_px, width, 0.0, 1.0, is_linear=True)
-
-
-def _mosaic_weights(mosaic: Mosaic) -> tuple[Float32Array, Float32Array, bool]:
-    """Weights (period_y, period_x) and offsets (period_y,) of a pixel that make each row measure the same mix.
+@dataclass(frozen=True, slots=True)
+class _ColourMix:
+    """How every row of a mosaic measures the same mix of colours.
 
     Green counts most, red and blue by the inverse square of their gains, which is near the best signal to noise. A row
     that lacks a colour (Bayer) cannot measure the mix: its mean is taken as it is, and rows are then smoothed so that
     each holds both kinds, at the price of one row of blur.
     """
-    pattern = mosaic.pattern
-    n = pattern.shape[1]
-    present = np.stack([(pattern == colour).sum(axis=1) for colour in range(3)], axis=1)
-    mix = 1 / np.maximum(np.array(mosaic.gains), 1.0) ** 2
-    complete = bool((present > 0)[:, mix > 0].all())
-    share = n * mix / mix.sum() / np.maximum(present, 1) if complete else np.ones(present.shape)
-    black = np.array(mosaic.black)
-    weights = share[np.arange(pattern.shape[0])[:, None], pattern] / (mosaic.white - black.mean())
-    offsets = (weights * black[pattern]).mean(axis=1)
-    return weights.astype(np.float32), offsets.astype(np.float32), complete
+
+    #: (period_y, period_x) weights of pixels, and (period_y,) offsets.
+    weights: Float32Array
+    offsets: Float32Array
+    is_complete: bool
+
+    @classmethod
+    def of(cls, mosaic: Mosaic) -> Self:
+        """The mix of a mosaic."""
+        pattern = mosaic.pattern
+        n = pattern.shape[1]
+        present = np.stack([(pattern == colour).sum(axis=1) for colour in range(3)], axis=1)
+        mix = 1 / np.maximum(np.array(mosaic.gains), 1.0) ** 2
+        complete = bool((present > 0)[:, mix > 0].all())
+        share = n * mix / mix.sum() / np.maximum(present, 1) if complete else np.ones(present.shape)
+        black = np.array(mosaic.black)
+        weights = share[np.arange(pattern.shape[0])[:, None], pattern] / (mosaic.white - black.mean())
+        offsets = (weights * black[pattern]).mean(axis=1)
+        return cls(weights.astype(np.float32), offsets.astype(np.float32), complete)
+
+    def cells(self, band: NDArray[Any], cell_px: int, top: int) -> Float32Array:
+        """Cells (rows, n) of a band of rows from row `top` on."""
+        phase = np.arange(top, top + len(band)) % len(self.weights)
+        weights = np.tile(self.weights, (1, cell_px // self.weights.shape[1]))[phase, :, None]
+        cells = band.astype(np.float32).reshape(len(band), -1, cell_px) @ weights
+        return np.asarray(cells[..., 0] - self.offsets[phase, None] * np.float32(cell_px))
+
+    def evened(self, cells: Float32Array) -> Float32Array:
+        """Cells (n, rows), smoothed where rows lack a colour."""
+        import cv2
+
+        smooth = np.array([[0.25, 0.5, 0.25]], np.float32)
+        return cells if self.is_complete else np.asarray(cv2.filter2D(cells, -1, smooth))

@@ -128,9 +128,21 @@ def screen_to_picture(points: FloatArray, corners: FloatArray, lens: Lens | None
         corners: (4, 2) pixels of the stored picture, the viewer's top-left first.
         lens: lens model of the picture; None or corrected: the screen's sides are straight.
     """
-    flat = undistort(corners, bending(lens))
-    projected = np.concatenate([points, np.ones_like(points[..., :1])], axis=-1) @ homography(flat).T
-    return distort(projected[..., :2] / projected[..., 2:], bending(lens))
+    lens = bending(lens)
+    return distort(projected(points, homography(undistort(corners, lens))), lens)
+
+
+def picture_to_screen(points: FloatArray, corners: FloatArray, lens: Lens | None) -> FloatArray:
+    """Pixels of the stored picture to screen points, the inverse of `screen_to_picture`."""
+    lens = bending(lens)
+    to_screen = np.linalg.inv(homography(undistort(corners, lens)))
+    return projected(undistort(points, lens), np.asarray(to_screen))
+
+
+def projected(points: FloatArray, matrix: FloatArray) -> FloatArray:
+    """Points (..., 2) under a homography (3, 3)."""
+    x, y, scale = np.moveaxis(points @ matrix[:, :2].T + matrix[:, 2], -1, 0)
+    return np.stack([x / scale, y / scale], axis=-1)
 
 
 def beside(corners: FloatArray, shares: FloatArray | float, lens: Lens | None) -> FloatArray:
@@ -142,18 +154,13 @@ def beside(corners: FloatArray, shares: FloatArray | float, lens: Lens | None) -
 
 def sides_off(corners: FloatArray, moved: FloatArray, lens: Lens | None) -> FloatArray:
     """(2,) shares of a screen's width by which left and right of corners `moved` lie to the right of its `corners`."""
-    flat = undistort(moved, bending(lens))
-    u, _, scale = np.linalg.inv(homography(undistort(corners, bending(lens)))) @ np.c_[flat, np.ones(4)].T
-    off = u / scale - _SQUARE[:, 0]
+    off = picture_to_screen(moved, corners, lens)[:, 0] - _SQUARE[:, 0]
     return np.array([off[[0, 3]].mean(), off[[1, 2]].mean()])
 
 
 def carried(corners: FloatArray, before: FloatArray, after: FloatArray, lens: Lens | None) -> FloatArray:
     """(4, 2) corners moved as the plane whose corners moved from `before` to `after`, (4, 2) each."""
-    lens = bending(lens)
-    motion = homography(undistort(after, lens)) @ np.linalg.inv(homography(undistort(before, lens)))
-    x, y, scale = motion @ np.c_[undistort(corners, lens), np.ones(4)].T
-    return distort(np.stack([x / scale, y / scale], axis=-1), lens)
+    return screen_to_picture(picture_to_screen(corners, before, lens), after, lens)
 
 
 def column_outlines(

@@ -64,7 +64,7 @@ class _Texture:
 class _Known:
     """The known texture of the screen on V x U cells."""
 
-    #: (3, V, U) u, v and 1 of the cells on the screen.
+    #: (V, U, 2) u and v of the cells on the screen.
     points: FloatArray
     #: (V, U) texture, and its reliability, 0..1.
     value: Float32Array
@@ -158,11 +158,10 @@ class ScreenTexture:
         return flat, float(np.sqrt(np.diag(np.linalg.inv(normal)).mean())), correlation
 
     def _read(self, texture: _Texture, flat: FloatArray, points: FloatArray) -> tuple[Float32Array, Float32Array]:
-        """Texture (...) at `points` (3, ...) of the screen, with the screen at `flat`; and its weight, 0 outside."""
+        """Texture (...) at `points` (..., 2) of the screen, with the screen at `flat`; and its weight, 0 outside."""
         import cv2
 
-        x, y, scale = np.tensordot(geometry.homography(flat), points, 1)
-        pixels = geometry.distort(np.stack([x / scale, y / scale], axis=-1), self._lens)
+        pixels = geometry.distort(geometry.projected(points, geometry.homography(flat)), self._lens)
         cells = ((pixels + (0.5 - texture.origin)) / texture.cell - 0.5).astype(np.float32)
         read = np.asarray(cv2.remap(texture.values, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR))
         return read[..., 0], read[..., 1]
@@ -223,16 +222,16 @@ def _known_of(texture: Float32Array) -> _Known:
         power = np.maximum(around(change * change * weight) / total, np.float32(TINY))
         change *= np.maximum(1 - noise_power / power, 0) * np.float32(n / (1 + 2 * SETTINGS.margin))
     points = _points(*value.shape)
-    u, v, _ = points
+    u, v = np.moveaxis(points, 2, 0)
     shares = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v]).astype(np.float32)
     return _Known(points, value, weight / (weight + 1), gradient[:, None] * shares)
 
 
 @cache
 def _points(n_v: int, n_u: int) -> FloatArray:
-    """(3, V, U) u, v and 1 of the cells of the screen, 0..1 between its sides."""
+    """(V, U, 2) u and v of the cells of the screen, 0..1 between its sides."""
     u, v = ((np.arange(n) + 0.5) / n * (1 + 2 * SETTINGS.margin) - SETTINGS.margin for n in (n_u, n_v))
-    return np.stack([*np.meshgrid(u, v), np.ones((n_v, n_u))])
+    return np.stack(np.meshgrid(u, v), axis=-1)
 
 
 def _size(corners: FloatArray) -> float:

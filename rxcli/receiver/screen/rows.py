@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rxcli.numerics import TINY, best_run
+from rxcli.receiver.screen import geometry
 from rxcli.receiver.screen.grid import Grid, columns_at, straightened
 from rxcli.receiver.screen.strips import PictureStrips
 from rxcli.types import Float32Array, FloatArray
@@ -65,8 +66,7 @@ class ScreenAxis:
         """(n, 2) pixels of (n, 2) columns and v."""
         u0, a, b, g, h, _ = self.grid.coefficients
         to_screen = np.linalg.inv([[a, b, 0], [self.c, self.d, self.v0], [g, h, 1]])
-        x, y, scale = to_screen @ np.stack([points[:, 0] - u0, points[:, 1], np.ones(len(points))])
-        return self.grid.pixels_of(np.stack([x / scale, y / scale], axis=-1))
+        return self.grid.pixels_of(geometry.projected(points - [u0, 0.0], to_screen))
 
     def corners(self, ends: tuple[float, float], first_column: int = 0) -> FloatArray:
         """(4, 2) corners, pixels, clockwise from the top left, of the screen between two v from `first_column` on."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from rxcli.receiver.frame.passes import Reception
-from rxcli.receiver.screen.geometry import homography
+from rxcli.receiver.screen.geometry import picture_to_screen
 from rxcli.receiver.screen.outline import Outline
 from rxcli.receiver.search import evidence
 from rxcli.receiver.search.hypothesis import Scored
@@ -94,8 +94,7 @@ def numbered(own: Outline, outlines: Sequence[Outline], score_of: Callable[[int]
 
 def _has_columns_of(own: Outline, rival: Outline) -> bool:
     """Whether a rival's columns are where one's own are, on whatever rows."""
-    points = np.pad(rival.corners, ((0, 0), (0, 1)), constant_values=1.0) @ np.linalg.inv(homography(own.corners)).T
-    off = points[:, 0] / points[:, 2] - [0, 1, 1, 0]
+    off = picture_to_screen(rival.corners, own.corners, None)[:, 0] - [0, 1, 1, 0]
     return rival.n_columns in (None, own.n_columns) and bool(np.abs(off).max() < SETTINGS.same_sides)
 
 
