@@ -101,11 +101,9 @@ def receiver_options(
         ("min_confidence", min_confidence, is_number(min_confidence, 0) and min_confidence <= 1, "in 0..1"),
         ("file_memory_mb", file_memory_mb, isinstance(file_memory_mb, int) and file_memory_mb > 0, "whole megabytes"),
         ("denoiser", denoiser, denoiser is None or hasattr(denoiser, "slot_corrections"), "a denoiser, or None"),
+        *(("no_skip", name, name in SKIPS, f"one of {', '.join(SKIPS)}") for name in names),
         ("dump_dir", dump_dir, dump_dir is None or isinstance(dump_dir, (str, Path)), "the path of a folder, or None"),
     )
-    for name in names:
-        if name not in SKIPS:
-            raise UsageError(f"no_skip: {name!r} is not one of {', '.join(SKIPS)}", "name one of them, or none")
     return ReceiverOptions(
         screens=_profiles(_listed("screens", screens), ScreenProfile),
         cameras=_profiles(named, CameraProfile),

@@ -9,8 +9,6 @@ import logging
 import re
 import tomllib
 from collections.abc import Iterable
-from itertools import chain
-from math import isfinite
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, overload
 
@@ -33,7 +31,15 @@ Seconds = Annotated[float, Meta(ge=1e-9, lt=1)]
 _MAX_BYTES = 1 << 18
 #: Names of the tone curves that `rxcli.receiver.sampling.rows.tone_to_light` can undo.
 ToneName = Literal["linear", "srgb", "bt709", "auto"]
-Triple = tuple[float, float, float]
+#: Focal length and centre of a picture, pixels; the other numbers of a camera matrix; a distortion coefficient, of
+#: which no calibration gives larger ones.
+Focal = Annotated[float, Meta(gt=0, le=1e9)]
+Centre = Annotated[float, Meta(ge=-1e9, le=1e9)]
+Zero = Annotated[float, Meta(ge=0, le=0)]
+One = Annotated[float, Meta(ge=1, le=1)]
+Coefficient = Annotated[float, Meta(ge=-1e3, le=1e3)]
+#: Largest focal length and centre, and least focal length, picture sizes.
+_FARTHEST = 1e3
 
 
 class _Checked(msgspec.Struct, frozen=True):
@@ -121,15 +127,20 @@ class LensModel(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     width: PositiveInt
     height: PositiveInt
-    camera_matrix: tuple[Triple, Triple, Triple]
+    camera_matrix: tuple[tuple[Focal, Zero, Centre], tuple[Zero, Focal, Centre], tuple[Zero, Zero, One]]
     #: k1 k2 p1 p2 k3, then up to k6, s1..s4, tx ty as OpenCV orders them.
-    dist_coeffs: Annotated[tuple[float, ...], Meta(min_length=4, max_length=14)]
+    dist_coeffs: Annotated[tuple[Coefficient, ...], Meta(min_length=4, max_length=14)]
     #: True if the camera corrects the distortion of its pictures.
     distortion_already_corrected: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_lens(self)
+        (fx, _, cx), (_, fy, cy), _ = self.camera_matrix
+        size = max(self.width, self.height)
+        if max(fx, fy, abs(cx), abs(cy)) > _FARTHEST * size or min(fx, fy) < size / _FARTHEST:
+            reason = f"camera_matrix does not fit a picture of {self.width} x {self.height} pixels"
+            matrix = [list(row) for row in self.camera_matrix]
+            raise ProfileError(f"lens: {reason} (got {matrix})", "correct it, or calibrate again")
 
 
 class CameraProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -160,8 +171,6 @@ class CameraProfile(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=T
         return model.strip().casefold() in {name.casefold() for name in self.models}
 
 
-#: Largest distortion coefficient of any calibration; largest focal length and centre, picture sizes.
-_LARGEST_COEFFICIENT, _FARTHEST = 1e3, 1e3
 _Profile = TypeVar("_Profile", ScreenProfile, CameraProfile)
 _KINDS: dict[type[Any], str] = {ScreenProfile: "screens", CameraProfile: "cameras"}
 
@@ -193,26 +202,6 @@ def check_profile(raw: dict[str, Any], kind: type[_Profile], source: str) -> _Pr
         raise ProfileError(f"{source}: {_explain(str(error), raw)}", "correct the file") from None
     except ProfileError as error:
         raise ProfileError(f"{source}: {error.message}", error.hint) from None
-
-
-def _check_lens(lens: LensModel) -> None:
-    (fx, skew, cx), (lower, fy, cy), last = lens.camera_matrix
-    if not all(map(isfinite, (*lens.dist_coeffs, *chain.from_iterable(lens.camera_matrix)))):
-        raise ProfileError("lens: camera_matrix and dist_coeffs must be finite numbers", "correct the numbers")
-    if fx <= 0 or fy <= 0 or (skew, lower) != (0.0, 0.0) or last != (0.0, 0.0, 1.0):
-        raise ProfileError(
-            "lens.camera_matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive fx and fy "
-            f"(got {[list(row) for row in lens.camera_matrix]})",
-            "correct the matrix",
-        )
-    largest, size = max(map(abs, lens.dist_coeffs)), max(lens.width, lens.height)
-    if largest > _LARGEST_COEFFICIENT:
-        reason = f"no lens has distortion coefficients beyond {_LARGEST_COEFFICIENT:g} (got {largest:g})"
-        raise ProfileError(f"lens: {reason}", "correct them, or calibrate again")
-    if max(fx, fy, abs(cx), abs(cy)) > _FARTHEST * size or min(fx, fy) < size / _FARTHEST:
-        reason = f"camera_matrix does not fit a picture of {lens.width} x {lens.height} pixels"
-        matrix = [list(row) for row in lens.camera_matrix]
-        raise ProfileError(f"lens: {reason} (got {matrix})", "correct it, or calibrate again")
 
 
 def _explain(message: str, raw: dict[str, Any]) -> str:

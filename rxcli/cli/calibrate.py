@@ -65,26 +65,17 @@ class _Results:
         )
         self._target: Path | None = save if name is None else user_dir() / "cameras" / f"{name}.toml"
 
-    def claim(
-        self,
-        read: list[Path],
-        *json_keys: str,
-        screen: str | None = None,
-        picture: Path | None = None,
-        more: tuple[Output | None, ...] = (),
-    ) -> None:
+    def claim(self, read: list[Path], *json_keys: str, screen: str | None = None, more: Output | None = None) -> None:
         """Refuse outputs that would destroy something; the profile may be added to.
 
         Args:
             read: files that the command reads.
             json_keys: keys of an earlier JSON of the command.
             screen: name or file of a profile that it reads.
-            picture: that it writes.
-            more: further outputs.
+            more: a further output.
         """
         profile = output("--save", self._target, CAMERA, makes_folder=True)
-        drawn = output("--picture", picture, PICTURE)
-        claim([json_output(self._json_path, *json_keys), profile, drawn, *more], read, (screen,), self._force)
+        claim([json_output(self._json_path, *json_keys), profile, more], read, (screen,), self._force)
 
     def write(
         self,
@@ -179,7 +170,7 @@ def lens(paths: tuple[Path, ...], board_size: tuple[int, int], every: int, pictu
     """
     wanted = _Results(given)
     board, files = Board(*board_size, **given), _files(paths)
-    wanted.claim(files, "rms_px", "camera_matrix", picture=picture)
+    wanted.claim(files, "rms_px", "camera_matrix", more=output("--picture", picture, PICTURE))
     unreadable, metadata = list[Rejected](), list[Metadata]()
     found, width, height = find_boards(_board_pictures(files, every, unreadable, metadata), board)
     result = calibrate_lens([*unreadable, *found], width, height)
@@ -232,8 +223,8 @@ def shutter(paths: tuple[Path, ...], frequencies: tuple[float, ...], screen: str
     refuse((screen and window, "--region goes with --frequency only", "leave it out"))
     wanted, files = _Results(given), _files(paths)
     export: Path | None = given["export"]
-    record_file = output("--export", export, json_with("format", "line_delay_s"))
-    wanted.claim(files, "readout_s", "line_delay_s", screen=screen, more=(record_file,))
+    exchanged = output("--export", export, json_with("format", "line_delay_s"))
+    wanted.claim(files, "readout_s", "line_delay_s", screen=screen, more=exchanged)
     chosen = _frames(files, given["frames"])
     raw = chosen[0].mosaic is not None  # its rows are the sensor's
     along: Any = "rows" if raw or (screen and axis == "auto") else None if axis == "auto" else axis
@@ -248,28 +239,23 @@ def shutter(paths: tuple[Path, ...], frequencies: tuple[float, ...], screen: str
     record, lines = _shutter_report(result)
     name = given["mode"]
     if export is not None:
-        write_json(_exchanged(result, chosen[0].metadata, name), str(export))
+        write_json(_exchanged(result, record, chosen[0].metadata, name), str(export))
     wanted.write(record, lines, chosen[0].metadata, lambda profile: _with_shutter(profile, result, name), result.doubts)
 
 
-def _exchanged(result: ShutterCalibration, camera: Metadata, mode: str | None) -> dict[str, Any]:
+def _exchanged(
+    result: ShutterCalibration, record: dict[str, Any], camera: Metadata, mode: str | None
+) -> dict[str, Any]:
     """The readout of one mode for other programs; a lamp does not show the direction of the readout."""
-    height, width = result.shape
     return {
         "format": "rolling-shutter-readout/1",
         "make": camera.make,
         "model": camera.model,
-        "mode": mode or f"{width}x{height}",
-        "width": width,
-        "height": height,
-        "axis": result.axis,
+        "mode": mode or f"{record['width']}x{record['height']}",
         "direction": None if result.lamps else "upwards" if REVERSED in result.warnings else "downwards",
         "lines": result.n_lines,
-        "line_delay_s": result.line_delay_s,
-        "line_delay_interval95_s": result.line_delay_interval_s,
-        "readout_s": result.readout_s,
-        "readout_interval95_s": result.readout_interval_s,
-        "warnings": [*result.warnings, *result.doubts],
+        **{key: record[key] for key in ("width", "height", "axis", "line_delay_s", "readout_s", "warnings")},
+        **{f"{key}_interval95_s": record[f"{key}_interval_s"] for key in ("line_delay", "readout")},
     }
 
 
@@ -283,20 +269,17 @@ def _frames(paths: list[Path], n: int) -> list[Frame]:
     return frames
 
 
-def _mode(result: ShutterCalibration, name: str | None = None) -> ReadoutMode:
-    """The readout mode that was measured."""
+def _with_shutter(profile: CameraProfile, result: ShutterCalibration, name: str | None = None) -> CameraProfile:
+    """The profile with the readout mode that was measured, and the lens that was estimated with it."""
     if result.axis == "columns":
         reason = "the readout runs along the columns: the stored picture was rotated, and profiles hold stored rows"
         raise UsageError(reason, "calibrate with an unrotated picture")
     if name is not None and not NAME.fullmatch(name):
         raise UsageError(f"--mode {name!r} cannot name a mode", _NAME_HINT)
     height, width = result.shape
-    return ReadoutMode(name=name or f"{width}x{height}", width=width, height=height, line_delay_s=result.line_delay_s)
-
-
-def _with_shutter(profile: CameraProfile, result: ShutterCalibration, mode: str | None) -> CameraProfile:
-    """The profile with the readout mode that was measured, and the lens that was estimated with it."""
-    profile = with_mode(profile, _mode(result, mode))
+    name = name or f"{width}x{height}"
+    mode = ReadoutMode(name=name, width=width, height=height, line_delay_s=result.line_delay_s)
+    profile = with_mode(profile, mode)
     return profile if result.lens is None else with_lens(profile, result.lens)
 
 
@@ -378,8 +361,7 @@ def gyroflow(path: Path, size: tuple[int, int] | None, photo: Path | None, scree
     notes = [*found.notes, *([_agreement(found.readout_s, measured.readout_s)] if measured else [])]
 
     def extended(profile: CameraProfile) -> CameraProfile:
-        profile = with_lens(profile, found.lens, found.lens_name or None)
-        return with_mode(profile, _mode(measured)) if measured else profile
+        return with_lens(_with_shutter(profile, measured) if measured else profile, found.lens, found.lens_name or None)
 
     camera, at = f"{found.make} {found.model}".strip(), f", {found.lens.width} x {found.lens.height}"
     record, lines = _converted_report(found, camera, at, "the fisheye model")

@@ -116,16 +116,13 @@ def _claim(given: dict[str, Any], sources: list[batch.Source]) -> outputs.Taken:
 
 def _outputs(given: dict[str, Any]) -> list[outputs.Output | None]:
     """Every file that the run will write."""
-    table = outputs.PARQUET_SUMMARY
-    if given["summary"] is not None and given["summary"].suffix.casefold() == ".csv":
-        table = outputs.CSV_SUMMARY
     way_on = "go on with it by --resume, replace it with --force, or name another file"
     # Resuming looks closer, and knows half lines.
     ours = (outputs.ANYTHING, None) if given["resume"] else (outputs.JOURNAL, way_on)
     return [
         output("--json", given["json_path"], ours[0], way_on=ours[1]),
         output("--junit", given["junit"], outputs.JUNIT),
-        output("--summary", given["summary"], table),
+        output("--summary", given["summary"], outputs.SUMMARY),
         output("--save-camera", given["save_camera"], outputs.ESTIMATED_CAMERA),
         output("--payloads", given["payloads"], outputs.PAYLOADS),
     ]

@@ -68,10 +68,8 @@ class Table(Writer):
             self.has_table |= bool(result.packets)
             print_text(report.format_frame(result) + "\n")
         elif self._packets and result.packets:
-            if not self._has_header:
-                print_text(report.table_header(clip=True, scored=self._scored))
+            print_text("\n".join(report.packet_table(result, True, self._scored, not self._has_header)))
             self.has_table = self._has_header = True
-            print_text("\n".join(report.table_rows(result, clip=True, scored=self._scored)))
 
     def end(self, summary: SourceSummary) -> None:
         """Print the line of a clip."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import io
 import secrets
 import signal
 import sys
@@ -76,18 +75,12 @@ async def _run(site: Site) -> None:
         for_phones = " For a phone in the same network: vlc-rx serve --host 0.0.0.0"
         if site.token is not None:
             for_phones = ""
-            _show_qr(server.address)
+            import segno
+
+            segno.make(server.address, micro=False).terminal(sys.stderr, compact=True, border=2)
         click.echo(server.address)
         for address in server.addresses[1:]:
             click.echo(f"or {address}", err=True)
         click.echo(f"Ctrl-C stops it.{for_phones}", err=True)
         sys.stdout.flush()
         await stopped.wait()
-
-
-def _show_qr(address: str) -> None:
-    import segno
-
-    text = io.StringIO()
-    segno.make(address, micro=False).terminal(text, compact=True, border=2)
-    click.echo(text.getvalue(), err=True)

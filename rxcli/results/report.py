@@ -108,12 +108,10 @@ def format_frame(result: FrameResult) -> str:
     lines = [format_heading(result), *(f"  {text}" for text in texts if text)]
     clip = _is_clip(result)
     scored = any(packet.bit_errors is not None for packet in result.packets)
-    rows = table_rows(result, clip, scored)
-    if rows:
-        lines += [table_header(clip, scored), *rows]
+    lines += packet_table(result, clip, scored)
     for screen in result.other_screens:
         lines += [f"  another screen: {_place(screen)} | screen {screen.screen_profile} | {_counts(screen)}"]
-        lines += [table_header(clip, scored), *table_rows(screen, clip, scored)]
+        lines += packet_table(screen, clip, scored)
     return "\n".join(lines)
 
 
@@ -200,11 +198,6 @@ def _goes_on(result: FrameResult) -> bool:
     return result.status == "ok" and bool(result.columns) and not result.packets
 
 
-def table_header(clip: bool, scored: bool) -> str:
-    """Header of `table_rows`."""
-    return _table_line({key: title for key, title, _, _ in PACKET_TABLE}, clip, scored)
-
-
 def _table_line(cells: Mapping[str, Any], clip: bool, scored: bool) -> str:
     """The cells of the packets' table that are shown, side by side."""
     hidden = (() if clip else ("time_s", "burst")) + (() if scored else ("errors",))
@@ -222,13 +215,14 @@ def _cell(value: Any, form: str) -> str:
     return value if isinstance(value, str) else format(value, form)
 
 
-def table_rows(result: FrameResult, clip: bool, scored: bool) -> list[str]:
+def packet_table(result: FrameResult, clip: bool, scored: bool, header: bool = True) -> list[str]:
     """One row per packet; columns without packets share a row where their reasons agree, and are left out in a clip.
 
     Args:
         result: of a frame.
         clip: whether it is a frame of a clip, whose packets have a time and a burst.
         scored: whether wrong bits are counted.
+        header: whether titles stand above the rows, where there are any.
     """
     rows: list[str] = []
     # Columns with packets stand alone; of one reason the first is shown, whose figures are about those of the others.
@@ -240,7 +234,8 @@ def table_rows(result: FrameResult, clip: bool, scored: bool) -> list[str]:
         elif not clip:
             span = f"{column.column}-{equal[-1].column}" if equal else str(column.column)
             rows.append(f"  {span:>5}  {column.status:<9}  {column.message or ''}".rstrip())
-    return rows
+    titles = [_table_line({key: title for key, title, _, _ in PACKET_TABLE}, clip, scored)]
+    return titles * (header and bool(rows)) + rows
 
 
 def _shown(packet: Mapping[str, Any]) -> dict[str, Any]:
