@@ -19,7 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, TemporaryFile
 from typing import TYPE_CHECKING
 
-from rxcli.errors import OutputError, UsageError, reason_of
+from rxcli.errors import OutputError, UsageError, failure_explained, reason_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -205,13 +205,11 @@ def _identity(path: Path) -> object | None:
 def _check_place(output: Output) -> None:
     """Refuse a folder, and a name in a missing folder."""
     path = output.path
-    try:
+    with failure_explained(f"{output}: cannot be looked at", "name another file", UsageError):
         if path.is_dir():
             raise UsageError(f"{output}: is a folder", "name a file")
         if not output.makes_folder and not path.resolve().parent.is_dir():
             raise UsageError(f"{output}: there is no such folder", "make it, or name another")
-    except (OSError, ValueError, RuntimeError) as error:
-        raise UsageError(f"{output}: {reason_of(error)}", "name another file") from None
 
 
 def is_stream(path: Path) -> bool:
@@ -223,16 +221,13 @@ def is_stream(path: Path) -> bool:
 
 
 def _check_ours(output: Output, step: str = "name another file, or replace it with --force") -> None:
-    try:
-        with output.path.open("rb") as file:
-            head = file.read(_SAMPLED_BYTES)
-            rest = file.seek(0, os.SEEK_END) - len(head)
-            file.seek(-min(rest, _SAMPLED_BYTES), os.SEEK_END)
-            head += file.read() if rest else b""
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        raise UsageError(f"{output}: cannot be looked at ({reason_of(error)})", "name another file") from None
+    head = b""
+    explained = failure_explained(f"{output}: cannot be looked at", "name another file", UsageError)
+    with explained, suppress(FileNotFoundError), output.path.open("rb") as file:
+        head = file.read(_SAMPLED_BYTES)
+        rest = file.seek(0, os.SEEK_END) - len(head)
+        file.seek(-min(rest, _SAMPLED_BYTES), os.SEEK_END)
+        head += file.read() if rest else b""
     ours = not head or output.ours.search(head)
     if head and ours and output.way_on is not None:
         raise UsageError(f"{output}: holds the results of an earlier run", output.way_on)

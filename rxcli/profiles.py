@@ -31,12 +31,12 @@ Seconds = Annotated[float, Meta(ge=1e-9, lt=1)]
 _MAX_BYTES = 1 << 18
 #: Names of the tone curves that `rxcli.receiver.sampling.rows.tone_to_light` can undo.
 ToneName = Literal["linear", "srgb", "bt709", "auto"]
-#: Focal length and centre of a picture, pixels; the other numbers of a camera matrix; a distortion coefficient, of
-#: which no calibration gives larger ones.
+#: Focal length and centre of a picture, pixels; the other numbers of a camera matrix; distortion coefficients:
+#: calibrations give smaller ones.
 Focal = Annotated[float, Meta(gt=0, le=1e9)]
 Centre = Annotated[float, Meta(ge=-1e9, le=1e9)]
 Zero = Annotated[float, Meta(ge=0, le=0)]
-One = Annotated[float, Meta(ge=1, le=1)]
+Unit = Annotated[float, Meta(ge=1, le=1)]
 Coefficient = Annotated[float, Meta(ge=-1e3, le=1e3)]
 #: Largest focal length and centre, and least focal length, picture sizes.
 _FARTHEST = 1e3
@@ -127,7 +127,7 @@ class LensModel(_Checked, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     width: PositiveInt
     height: PositiveInt
-    camera_matrix: tuple[tuple[Focal, Zero, Centre], tuple[Zero, Focal, Centre], tuple[Zero, Zero, One]]
+    camera_matrix: tuple[tuple[Focal, Zero, Centre], tuple[Zero, Focal, Centre], tuple[Zero, Zero, Unit]]
     #: k1 k2 p1 p2 k3, then up to k6, s1..s4, tx ty as OpenCV orders them.
     dist_coeffs: Annotated[tuple[Coefficient, ...], Meta(min_length=4, max_length=14)]
     #: True if the camera corrects the distortion of its pictures.

@@ -15,7 +15,7 @@ from typing import Any
 from rxcli import __version__, outputs
 from rxcli.cli.common import output, receiver_options, refuse
 from rxcli.cli.printing import JsonLines, Progress, Table, Writer, print_line, print_text
-from rxcli.errors import ExitCode, InputError, ReceiverError, worst
+from rxcli.errors import ExitCode, InputError, ReceiverError, failure_explained, worst
 from rxcli.ingest import KNOWN_SUFFIXES, MAX_BYTES, open_source
 from rxcli.link.collector import PhotoCollector
 from rxcli.link.saving import save_objects
@@ -136,17 +136,15 @@ def _stdin_as_file(sources: list[batch.Source]) -> Iterator[list[batch.Source]]:
         return
     if sys.stdin is None:
         raise InputError("stdin is closed", "name a file instead of -")
+    step = "make room, or set TMPDIR to another folder"
     with ExitStack() as stack:
-        try:
+        with failure_explained("stdin: cannot be kept in a temporary file", step):
             file = stack.enter_context(NamedTemporaryFile(prefix="vlc-rx-"))
             while part := sys.stdin.buffer.read(_STDIN_BYTES):
                 file.write(part)
                 if file.tell() > MAX_BYTES:
                     raise InputError(f"stdin: more than {MAX_BYTES / 1e9:g} GB", "name a file instead of -")
             file.flush()
-        except OSError as error:
-            reason = f"stdin: cannot be kept in a temporary file ({error.strerror or error})"
-            raise InputError(reason, "make room, or set TMPDIR to another folder") from None
         yield [replace(source, path=file.name) if source.name == STDIN else source for source in sources]
 
 

@@ -127,15 +127,11 @@ def _weights(text: str, columns: int) -> NDArray[np.int64]:
     if text.endswith(".json"):
         with failure_explained(f"--weights {text}: cannot be read", "name a JSON file"):
             data = Path(text).read_bytes()
-    try:
+    reason = f"--weights {text}: no number, list of {columns} numbers, or JSON file of such lists"
+    with failure_explained(reason, "give 1..9 for every column", UsageError):
         found = [int(part) for part in text.split(",")] if data is None else json.loads(data)
         values = np.asarray(found, np.int64)
         weights = np.broadcast_to(values, (values.shape[0] if values.ndim == 2 else 1, columns))
-    except (ValueError, TypeError, OverflowError):
-        raise UsageError(
-            f"--weights {text}: no number, list of {columns} numbers, or JSON file of such lists",
-            "give 1..9 for every column",
-        ) from None
     refuse((weights.min() < 1 or weights.max() > 9, f"--weights {text}: weights are 1 to 9", "choose from 1..9"))
     return weights
 

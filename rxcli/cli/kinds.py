@@ -1,6 +1,6 @@
 """Kinds of values that options take: what the command line gives, checked and typed."""
 
-import math
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -49,11 +49,10 @@ class Exposure(click.ParamType[float]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Between 0 and 10 seconds."""
-        numerator, _, denominator = str(value).partition("/")
         try:
-            seconds = float(numerator) / float(denominator or 1)
-        except (ValueError, ZeroDivisionError):
-            seconds = math.nan
+            seconds = float(Fraction(str(value)))
+        except (ValueError, ZeroDivisionError, OverflowError):
+            seconds = 0.0
         if not 0 < seconds < 10:
             self.fail(f"{value!r} is no time; give seconds up to 10, or a fraction such as 1/8000", param, ctx)
         return seconds

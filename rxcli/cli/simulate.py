@@ -14,7 +14,7 @@ from rxcli.cli.common import field_table, force_argument, options, output, refus
 from rxcli.cli.kinds import FILE, FOLDER, POSITIVE, Exposure, Numbers
 from rxcli.cli.printing import with_progress
 from rxcli.cli.sending import payload_bytes, sending_of
-from rxcli.errors import UsageError
+from rxcli.errors import UsageError, failure_explained
 from rxcli.lab.simulate.capture import Recording, prepare, write_capture
 from rxcli.lab.simulate.files import CODECS
 from rxcli.lab.simulate.pictures import picture_names
@@ -190,10 +190,9 @@ def _delays(delays: tuple[float, ...], n_columns: int) -> float | tuple[float, .
 def _weights(text: str) -> Weights:
     if text == "dimming":
         return "dimming"
-    try:
+    step = "give 1..9, a list of them, or 'dimming'"
+    with failure_explained(f"--weights: {text!r} is no weight", step, UsageError):
         values = tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise UsageError(f"--weights: {text!r} is no weight", "give 1..9, a list of them, or 'dimming'") from None
     return values[0] if len(values) == 1 else values
 
 

@@ -185,17 +185,13 @@ class Decoder:
         options, count = self.options, 0
         if options.dump_dir is not None:  # each source has a place of its own for its taps
             options = replace(options, dump_dir=options.dump_dir / source.subfolder)
-        try:
+        with _gathering(problems, source):
             for result in self.linked(self.receive(self._frames(source, problems), options)):
                 result = replace(result, source=source.name)
                 if self.after is not None:
                     self.after(result, source.subfolder)
                 yield result
                 count += 1
-        except _ENDS_RUN:
-            raise
-        except Exception as error:
-            problems.append((_problem(error, source), _may_pass(error)))
         if not (problems or count):
             problems.append((f"{source.name}: holds no picture; name another file", False))
         if problems:
@@ -221,7 +217,7 @@ class Decoder:
     def _frames(self, source: Source, problems: list[tuple[str, bool]]) -> Iterator[Frame]:
         """The frames of a source up to a failure, which joins `problems`: the receiver still gives what it holds."""
         warned = False
-        try:
+        with _gathering(problems, source):
             if source.problem:
                 raise InputError(source.problem)
             for frame in self.open_source(source.path):
@@ -232,10 +228,17 @@ class Decoder:
                 if self.tap is not None:
                     self.tap(frame, source.subfolder)
                 yield frame
-        except _ENDS_RUN:
-            raise
-        except Exception as error:
-            problems.append((_problem(error, source), bool(source.problem) or _may_pass(error)))
+
+
+@contextmanager
+def _gathering(problems: list[tuple[str, bool]], source: Source) -> Iterator[None]:
+    """Let an error in a source, which ends no run, join its `problems`: message, and whether a later run may do."""
+    try:
+        yield
+    except _ENDS_RUN:
+        raise
+    except Exception as error:
+        problems.append((_problem(error, source), bool(source.problem) or _may_pass(error)))
 
 
 def _problem(error: Exception, source: Source) -> str:

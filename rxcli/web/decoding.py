@@ -216,15 +216,12 @@ def answer_for(
 ) -> dict[str, Any]:
     """The answer for one file; see `DecodingProcess.decode`. A photo is added to `photos`."""
     started_s = time.monotonic()
-    try:
-        _check_pixels(path)
-    except InputError as error:
-        return refusal(error.message, error.hint)
     gathered, wait_s, published_s = _Gathered(options, time.process_time() + _CLIP_S), _PARTIAL_S, started_s
     if photos and photos.camera:  # the photos of one visitor are by one camera
         options = replace(options, cameras=(photos.camera, *options.cameras))
     decoder = Decoder(options, gathered.tap)
     try:
+        _check_pixels(path)
         for result in decoder.results(Source(name, str(path))):
             gathered.add(_without(photos.add(result) if photos else result, path))
             if photos and gathered.frame is not None and result.frame == 0:
@@ -233,6 +230,8 @@ def answer_for(
                 publish(gathered.answer() | {"name": name, "partial": True})
                 wait_s, published_s = 2 * wait_s, time.monotonic()
         answer = gathered.answer()
+    except InputError as error:
+        return refusal(error.message, error.hint)
     except MemoryError:
         return refusal("it takes too much memory", "try a smaller picture")
     together = _files(photos.progress) if photos else None

@@ -28,7 +28,7 @@ from typing import Any, Self
 from aiohttp import web
 from aiohttp.http_exceptions import HttpProcessingError
 
-from rxcli.errors import UsageError
+from rxcli.errors import UsageError, failure_explained
 from rxcli.ingest.v4l2 import CameraSettings
 from rxcli.options import ReceiverOptions
 from rxcli.outputs import claim_folder
@@ -247,15 +247,12 @@ class Server:
         await self._runner.setup()
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._thread, self._decoder.start)
-        try:
+        with failure_explained(f"cannot serve at {site.host}:{site.port}", "choose another --port", UsageError):
             if site.host == "::" and socket.has_dualstack_ipv6():  # asyncio would not listen to IPv4
                 dual = socket.create_server(("::", site.port), family=socket.AF_INET6, dualstack_ipv6=True)
                 await web.SockSite(self._runner, dual, backlog=32).start()
             else:
                 await web.TCPSite(self._runner, site.host, site.port, backlog=32).start()
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise UsageError(f"cannot serve at {site.host}:{site.port} ({reason})", "choose another --port") from None
         self.port = self._runner.addresses[0][1]
         self._sweeper = asyncio.create_task(self._sweep())
         if site.device is not None:
