@@ -289,7 +289,7 @@ def _fit_near(
     if not abs(state[-1] - frequency) <= 0.6 / n:
         return None
     mean, envelope, cosines, sines, *_ = parts(state)
-    trend = profile - slow @ np.linalg.lstsq(slow, profile, rcond=None)[0]
+    trend = _detrend(profile, n_slow)
     scaled = jacobian / (np.linalg.norm(jacobian, axis=0) + 1e-300)
     influence = scaled @ np.linalg.pinv(scaled.T @ scaled, hermitian=True)[-1] / np.linalg.norm(jacobian[:, -1])
     return PeriodicFit(

@@ -51,8 +51,6 @@ class Switched:
     step: FloatArray
     #: Whether a switched lamp explains the stripes.
     fits: bool
-    #: Weighted squares that the likeliest cell leaves.
-    cost: float
 
     @property
     def depth(self) -> FloatArray:
@@ -107,7 +105,7 @@ def fit_switched(wave: Wave, exposures: FloatArray, blurs_rows: tuple[float, ...
         shorter = exposure[allowed] <= np.minimum(share[allowed], 1 - share[allowed]) + 1e-3
         allowed = allowed[shorter] if shorter.any() else allowed
     explained = 1 - left / float(np.sum(np.abs(wave.amplitudes) ** 2 / variance))
-    return Switched(share[allowed], exposure[allowed], step[allowed], explained > _MIN_EXPLAINED, float(cost.min()))
+    return Switched(share[allowed], exposure[allowed], step[allowed], explained > _MIN_EXPLAINED)
 
 
 def _cells(

@@ -1,5 +1,6 @@
 """`vlc-rx simulate`: captures with truth."""
 
+import json
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
@@ -20,9 +21,10 @@ from rxcli.lab.simulate.files import CODECS
 from rxcli.lab.simulate.pictures import picture_names
 from rxcli.lab.simulate.scenes import PRESETS, Scene, preset, with_fields
 from rxcli.lab.simulate.transmitter import PICTURE_FILES, Weights, export_picture
-from rxcli.lab.simulate.truth import build_camera_profile, truth_path, write_truth
+from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.link.slots import WRITERS, read_slots
 from rxcli.profiles import ScreenProfile, dump_profile
+from rxcli.results.truth import truth_path
 
 _STILLS = ("jpeg", "dng", "dng14", "png", "png16", "tiff", "tiff16")
 _FORMATS = (*_STILLS, *CODECS)
@@ -92,9 +94,9 @@ def simulate(out: Path, **options: Any) -> None:
     scene = _scene(options, file_format)
     capture = prepare(scene, options["seed"])
     _warn_of_cut_packets(capture)
-    truth = _write(capture, out, file_format, options["bit_rate"])
+    _write(capture, out, file_format, options["bit_rate"])
     _write_extras(capture, options)
-    click.echo(f"{out} and {truth.name}: {_summary(capture)}", err=True)
+    click.echo(f"{out} and {truth_path(out).name}: {_summary(capture)}", err=True)
 
 
 def _claim(out: Path, options: dict[str, Any]) -> None:
@@ -207,14 +209,14 @@ def _warn_of_cut_packets(capture: Recording) -> None:
         click.echo(f"vlc-rx: no packet fits a frame: {reason}; only clips put packets together", err=True)
 
 
-def _write(capture: Recording, out: Path, file_format: str, bit_rate: int | None) -> Path:
-    """Write the capture and its truth; returns the truth's path."""
+def _write(capture: Recording, out: Path, file_format: str, bit_rate: int | None) -> None:
+    """Write the capture and its truth."""
     progress = partial(with_progress, what=out.name, unit="frames")
     with outputs.replacing(out) as hidden:
         write_capture(capture, hidden, file_format, bit_rate, progress)
     # The payload of a file of slots is in the truth that `encode` wrote.
     unknown: dict[str, Any] = {"payload": {}} if capture.scene.waveform is not None else {}
-    return write_truth(capture.truth(out.name) | unknown, out)
+    outputs.write_whole(truth_path(out), json.dumps(capture.truth(out.name) | unknown, indent=1) + "\n")
 
 
 def _write_extras(capture: Recording, options: dict[str, Any]) -> None:

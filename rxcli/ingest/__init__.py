@@ -4,6 +4,7 @@ Readers are imported when a file of their kind comes, because each brings a heav
 """
 
 from collections.abc import Callable, Generator, Iterator
+from importlib import import_module
 from pathlib import Path
 
 from rxcli.errors import InputError, UsageError
@@ -13,6 +14,18 @@ from rxcli.types import Frame
 
 __all__ = ["KNOWN_SUFFIXES", "MAX_BYTES", "begun", "open_source"]
 
+#: Kind of a file -> module of this room and function of it that reads a path: a frame, or several.
+_READERS: dict[Kind, str] = {
+    "jpeg": "image.read_jpeg",
+    "png": "image.read_png",
+    "tiff": "image.read_tiff",
+    "other_image": "image.read_other",
+    "heif": "heif.read_heif",
+    "jxl": "jxl.read_jxl",
+    "raw": "raw.read_raw",
+    "video": "video.read_video",
+    "device": "v4l2.LiveSource",
+}
 #: Bytes in which JPEGs in a row show: three at least.
 _ROW_BYTES = 1 << 26
 
@@ -36,7 +49,9 @@ def open_source(path: str | Path) -> Generator[Frame, None, None]:
     if kind is None:
         known = "JPEG, PNG, TIFF, HEIC, camera RAW, MP4, MOV, MKV or AVI"
         raise InputError(f"{path}: neither a picture nor a clip", f"{known} can be read")
-    yield from _read(path, kind)
+    module, reader = _READERS[kind].split(".")
+    found = getattr(import_module(f"{__name__}.{module}"), reader)(path)
+    yield from [found] if isinstance(found, Frame) else found
 
 
 def begun(path: str) -> Callable[[str], Iterator[Frame]]:
@@ -58,22 +73,3 @@ def _kind(path: Path) -> Kind | None:
 
         return "raw" if is_raw_tiff(path) else "tiff"
     return kind
-
-
-def _read(path: Path, kind: Kind) -> Iterator[Frame]:
-    if kind == "video":
-        from rxcli.ingest.video import read_video
-
-        yield from read_video(path)
-    elif kind == "device":
-        from rxcli.ingest.v4l2 import LiveSource
-
-        yield from LiveSource(path)
-    elif kind == "raw":
-        from rxcli.ingest.raw import read_raw
-
-        yield read_raw(path)
-    else:
-        from rxcli.ingest.image import read_image
-
-        yield read_image(path, kind)

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rxcli.errors import InputError, failure_explained
-from rxcli.ingest.luma import BT601, BT709, Weights
+from rxcli.ingest.luma import BT601, BT709, colour_frame
 from rxcli.ingest.metadata import exif_metadata, turned
 from rxcli.ingest.orientation import PROBE, as_stored, orientation_of
-from rxcli.ingest.sniff import check_size
-from rxcli.types import Metadata
+from rxcli.ingest.sniff import check_size, read_bytes
+from rxcli.types import Frame
 
 #: Samples a pixel of the planes by their chroma; full ones are held twice.
 _PLANES = {420: 1.5, 422: 6.0, 444: 6.0}
@@ -24,8 +23,8 @@ _PLANES = {420: 1.5, 422: 6.0, 444: 6.0}
 _MATRIX_BT709 = 1
 
 
-def read_heif(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]:
-    """Samples as stored, and metadata with the orientation that the file asks for, and the weights of luma.
+def read_heif(path: Path) -> Frame:
+    """Read samples as stored, and metadata with the orientation that the file asks for.
 
     Raises:
         InputError: damaged, or the extra is not installed.
@@ -34,6 +33,7 @@ def read_heif(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]
         import pillow_heif
     except ImportError:
         raise InputError(f"{path}: HEIC needs pillow-heif", "run `pip install pillow-heif`, or save as JPEG") from None
+    data = read_bytes(path)
     with failure_explained(f"{path}: the HEIC picture is damaged", "copy the file again"):
         file = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
         orientation = _orientation(file[file.primary_index])
@@ -43,7 +43,7 @@ def read_heif(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata, Weights]
     matrix = (file.info.get("nclx_profile") or {}).get("matrix_coefficients")
     metadata = exif_metadata(*(file.info.get(kind) or b"" for kind in ("exif", "xmp")))
     weights = BT709 if matrix == _MATRIX_BT709 else BT601
-    return as_stored(pixels, orientation), turned(metadata, orientation), weights
+    return colour_frame(path, as_stored(pixels, orientation), turned(metadata, orientation), weights)
 
 
 def _bytes_a_pixel(file: Any, is_turned: bool) -> float:

@@ -1,4 +1,4 @@
-"""Developed pictures -> luma as stored: JPEG, PNG, TIFF, HEIC, and what else Pillow reads.
+"""Developed pictures -> luma as stored: JPEG, PNG, TIFF, and what else Pillow reads.
 
 Colour is reduced to BT.601 luma, which is what a JPEG of the same picture would hold.
 """
@@ -20,56 +20,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rxcli.errors import InputError, failure_explained
+from rxcli.ingest import jpeg
 from rxcli.ingest.extent import Directories
-from rxcli.ingest.luma import BT601, THINNED, Luma, Weights, colours_of, luma_of
+from rxcli.ingest.luma import THINNED, Luma, colour_frame, colours_of, luma_of
 from rxcli.ingest.metadata import ORIENTATION, exif_metadata, jpeg_metadata, orientation_of_tag, tiff_metadata
 from rxcli.ingest.quiet import quiet_libraries
-from rxcli.ingest.sniff import Kind, check_size, read_bytes, start_of_picture
-from rxcli.types import Frame, Metadata
+from rxcli.ingest.sniff import check_size, read_bytes, start_of_picture
+from rxcli.types import Frame
 
 
-def read_image(path: Path, kind: Kind) -> Frame:
-    """Read the frame of a developed picture; `kind` is that of `rxcli.ingest.sniff`.
-
-    Raises:
-        InputError: cut, damaged, too large, of a kind that needs an extra, or no picture.
-    """
-    if kind == "tiff":
-        return _read_tiff(path)
+def _picture(path: Path) -> bytes:
+    """The bytes of a file from where its picture starts."""
     data = read_bytes(path)
-    if kind == "jpeg":
-        return _read_jpeg(data[start_of_picture(data) :], path)
-    if kind == "png":
-        return _read_png(data[start_of_picture(data) :], path)
-    if kind == "jxl":
-        from rxcli.ingest.jxl import read_jxl
-
-        return _colour_frame(path, *read_jxl(data, path))
-    if kind == "heif":
-        from rxcli.ingest.heif import read_heif
-
-        return _colour_frame(path, *read_heif(data, path))
-    return _colour_frame(path, *_read_with_pillow(data, path))
+    return data[start_of_picture(data) :]
 
 
-def _frame(path: Path, luma: Luma, metadata: Metadata, linear: bool = False, white: int = 0) -> Frame:
-    white = white or np.iinfo(luma.dtype).max
-    return Frame(pixels=luma, source=str(path), metadata=metadata, white=float(white), linear=linear)
-
-
-def _colour_frame(path: Path, rgb: NDArray[Any], metadata: Metadata, weights: Weights = BT601) -> Frame:
-    """The frame of grey or RGB samples, whose colours it keeps."""
-    return replace(_frame(path, luma_of(rgb, weights), metadata), colours=colours_of(rgb, weights))
-
-
-def _read_jpeg(data: bytes, path: Path) -> Frame:
-    from rxcli.ingest import jpeg
-
-    data, metadata = jpeg.with_height(data), jpeg_metadata(data)
+def read_jpeg(path: Path) -> Frame:
+    """Read a JPEG."""
+    data = jpeg.with_height(_picture(path))
+    metadata = jpeg_metadata(data)
     if jpeg.header_of(data).is_uncommon:
         pixels, white = jpeg.decode_uncommon(data, path)
-        return replace(_colour_frame(path, pixels, metadata), white=white)
-    return replace(_frame(path, jpeg.decode_luma(data, path), metadata), colours=jpeg.colours_of(data))
+        return colour_frame(path, pixels, metadata, white=white)
+    return Frame(jpeg.decode_luma(data, path), str(path), metadata=metadata, colours=jpeg.colours_of(data))
 
 
 #: ISO 15948, table 11.1: samples of a pixel as they are decoded, by colour type; others may get an alpha.
@@ -79,17 +52,18 @@ _DEFLATE, _DIGITS = re.compile(rb"x[\x01\x5e\x9c\xda]"), re.compile(rb"\n\w+\s+\
 _MAX_CHUNK_BYTES = 1 << 20
 
 
-def _read_png(data: bytes, path: Path) -> Frame:
-    """By imagecodecs, which keeps 16 bits and passes over wrong check sums of what decides no pixel, with a warning."""
+def read_png(path: Path) -> Frame:
+    """Read a PNG by imagecodecs: it keeps 16 bits, and only warns of wrong check sums of what decides no pixel."""
     import imagecodecs
 
+    data = _picture(path)
     width, height, depth, colour = struct.unpack_from(">IIBB", data.ljust(26, b"\0"), 16)
     samples = _PNG_SAMPLES.get(colour, 4)
     held = (2 if depth == 16 else 1) * (samples + (samples > 1))  # and the luma that is made of colour
     check_size(path, width, height, held, 2 * len(data))
     with failure_explained(f"{path}: the PNG is damaged or cut", "copy the file again"), quiet_libraries():
         pixels = imagecodecs.png_decode(data)
-    return _colour_frame(path, pixels, exif_metadata(*_png_blocks(data)))
+    return colour_frame(path, pixels, exif_metadata(*_png_blocks(data)))
 
 
 def _png_blocks(data: bytes) -> Iterator[bytes]:
@@ -123,7 +97,8 @@ _FEW, _FAR = 1e-3, 4.0
 _MAX_PAGES, _READ_BYTES = 32, 1 << 20
 
 
-def _read_tiff(path: Path) -> Frame:
+def read_tiff(path: Path) -> Frame:
+    """Read the largest picture of a TIFF."""
     import tifffile
 
     logging.getLogger("tifffile").setLevel(logging.CRITICAL + 1)  # what matters comes as an exception
@@ -147,8 +122,8 @@ def _read_tiff(path: Path) -> Frame:
         colours = colours_of(pixels) if pixels.dtype == luma.dtype and page.photometric != _MIN_IS_WHITE else None
         is_packed = page.dtype.kind == "u" and page.photometric != _PALETTE and 1 < page.bitspersample < _PACKED_BITS
     white = (1 << page.bitspersample) - 1 if is_packed else np.iinfo(luma.dtype).max
-    frame = _frame(path, white - luma if page.photometric == _MIN_IS_WHITE else luma, metadata, linear, white)
-    return replace(frame, colours=colours)
+    luma = white - luma if page.photometric == _MIN_IS_WHITE else luma
+    return Frame(luma, str(path), metadata=metadata, white=float(white), linear=linear, colours=colours)
 
 
 def _picture_page(tiff: Any) -> Any:
@@ -186,11 +161,9 @@ def _check_page(page: Any, path: Path) -> None:
 
 def _jpeg_sizes(page: Any) -> Iterator[tuple[int, int]]:
     """Width and height of the JPEG pictures that the parts of a page are."""
-    from rxcli.ingest.jpeg import header_of
-
     for at, length in zip(page.dataoffsets, page.databytecounts, strict=False):
         page.parent.filehandle.seek(at)
-        header = header_of(page.parent.filehandle.read(length))
+        header = jpeg.header_of(page.parent.filehandle.read(length))
         yield header.width, header.height
 
 
@@ -227,10 +200,11 @@ def _brightest(pixels: NDArray[Any]) -> float:
     return min(top, _FAR * float(usual)) if usual > 0 else top
 
 
-def _read_with_pillow(data: bytes, path: Path) -> tuple[NDArray[np.uint8], Metadata]:
-    """AVIF, BMP, WebP: rare for a camera, but messengers send them. AVIF's own turns come as EXIF orientation."""
+def read_other(path: Path) -> Frame:
+    """Read AVIF, BMP or WebP: messengers send them. AVIF's own turns come as EXIF orientation."""
     from PIL import Image
 
+    data = read_bytes(path)
     with (
         failure_explained(f"{path}: the picture is damaged", "copy the file again"),
         warnings.catch_warnings(action="ignore"),  # sizes are checked here, and broken directories do no harm
@@ -239,4 +213,4 @@ def _read_with_pillow(data: bytes, path: Path) -> tuple[NDArray[np.uint8], Metad
         check_size(path, *image.size, 18, len(data))  # measured: WebP without loss takes most
         pixels = np.asarray(image if image.mode in ("L", "RGB") else image.convert("RGB"))
         blocks = (image.info.get(kind) or b"" for kind in ("exif", "xmp"))
-        return np.asarray(pixels, np.uint8), exif_metadata(*blocks)
+        return colour_frame(path, np.asarray(pixels, np.uint8), exif_metadata(*blocks))

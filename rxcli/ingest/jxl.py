@@ -2,15 +2,14 @@
 
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rxcli.errors import failure_explained
+from rxcli.ingest.luma import colour_frame
 from rxcli.ingest.metadata import exif_metadata, turned
-from rxcli.ingest.sniff import check_size
-from rxcli.types import Metadata
+from rxcli.ingest.sniff import check_size, read_bytes
+from rxcli.types import Frame
 
 _CODE = b"\xff\n"
 #: D.2, D.3: bits of a length by their kind, and widths as shares of the height; usual bits a sample.
@@ -22,14 +21,15 @@ _NOTE_BYTES = 1 << 20
 _BYTES_A_PIXEL = 30
 
 
-def read_jxl(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata]:
-    """Samples as stored, and metadata with the orientation that the code asks for.
+def read_jxl(path: Path) -> Frame:
+    """Read samples as stored, and metadata with the orientation that the code asks for.
 
     Raises:
         InputError: damaged, too large.
     """
     import imagecodecs
 
+    data = read_bytes(path)
     # Of code in parts, each has its number first.
     parts = ((kind, _content(data, kind)) for kind in (b"jxlc", b"jxlp"))
     code = next((content[4 * (kind == b"jxlp") :] for kind, content in parts if content), data)
@@ -41,7 +41,8 @@ def read_jxl(data: bytes, path: Path) -> tuple[NDArray[Any], Metadata]:
         pixels = np.rint(np.clip(pixels, 0, 1) * np.float32(65535)).astype(np.uint16)
     elif pixels.dtype == np.uint16:
         pixels <<= max(16 - bits, 0)
-    return pixels, turned(exif_metadata(*(_metadata_block(data, kind) for kind in (b"Exif", b"xml "))), orientation)
+    metadata = exif_metadata(*(_metadata_block(data, kind) for kind in (b"Exif", b"xml ")))
+    return colour_frame(path, pixels, turned(metadata, orientation))
 
 
 def _content(data: bytes, kind: bytes) -> bytes:

@@ -1,11 +1,12 @@
 """Colour reduced to luma."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.types import Colours, Float32Array
+from rxcli.types import Colours, Float32Array, Frame, Metadata
 
 Luma = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -27,6 +28,15 @@ def without_red(weights: Weights) -> Weights:
 def as_shares(samples: NDArray[Any]) -> Float32Array:
     """Integer samples as shares of the largest one."""
     return np.asarray(samples, np.float32) / np.float32(np.iinfo(samples.dtype).max)
+
+
+def colour_frame(
+    path: Path, samples: NDArray[Any], metadata: Metadata, weights: Weights = BT601, white: float | None = None
+) -> Frame:
+    """The frame of grey or RGB samples, whose colours it keeps; `white` is their largest number by default."""
+    white = float(np.iinfo(samples.dtype).max) if white is None else white
+    colours = colours_of(samples, weights)
+    return Frame(luma_of(samples, weights), str(path), metadata=metadata, white=white, colours=colours)
 
 
 def colours_of(pixels: NDArray[Any], weights: Weights = BT601) -> Colours | None:

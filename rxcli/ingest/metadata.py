@@ -98,7 +98,16 @@ def is_raw_tiff(path: Path) -> bool:
 def raw_metadata(path: Path) -> Metadata:
     """Metadata of a RAW file, from its own directories or the JPEG inside."""
     with suppress(OSError, struct.error), path.open("rb") as file:
-        return _raw_metadata(file)
+        head = file.read(HEAD := 128)
+        if head.startswith(b"FUJIFILMCCD-RAW"):
+            offset, length = struct.unpack_from(">II", head, 84)
+            file.seek(offset)
+            return jpeg_metadata(file.read(min(length, _HEADER_BYTES)))
+        if head[4:8] != b"ftyp":
+            return tiff_metadata(file)
+        head += file.read(_HEADER_BYTES - HEAD)
+        if (found := head.find(b"CMT1")) >= 0:  # the box of IFD0; LibRaw states the exposure
+            return exif_metadata(head[found + 4 :])
     return Metadata()
 
 
@@ -146,19 +155,6 @@ def merge(metadata: Metadata, fallback: Metadata) -> Metadata:
     """Fill the unknown fields of `metadata` from `fallback`."""
     unknown = {f.name: getattr(fallback, f.name) for f in fields(metadata) if getattr(metadata, f.name) is None}
     return replace(metadata, **unknown)
-
-
-def _raw_metadata(file: BinaryIO) -> Metadata:
-    head = file.read(HEAD := 128)
-    if head.startswith(b"FUJIFILMCCD-RAW"):
-        offset, length = struct.unpack_from(">II", head, 84)
-        file.seek(offset)
-        return jpeg_metadata(file.read(min(length, _HEADER_BYTES)))
-    if head[4:8] == b"ftyp":
-        head += file.read(_HEADER_BYTES - HEAD)
-        found = head.find(b"CMT1")  # the box of IFD0; LibRaw states the exposure
-        return exif_metadata(head[found + 4 :]) if found >= 0 else Metadata()
-    return tiff_metadata(file)
 
 
 def _from_tags(tags: Sequence[tuple[int, Any]], xmp: Iterable[bytes]) -> Metadata:

@@ -13,7 +13,7 @@ from rxcli.lab.simulate.isp import Isp, correction_map, develop, local_gain, ton
 from rxcli.lab.simulate.optics import Lens, Pose, View, distort, undistort
 from rxcli.lab.simulate.scenes import Scene, preset
 from rxcli.lab.simulate.sensor import Sensor, count_electrons, pick_colours, to_raw
-from rxcli.lab.simulate.shutter import flicker, lagging_share, lit_share, slot_shares
+from rxcli.lab.simulate.shutter import flicker, lit_share, slot_shares
 from rxcli.lab.simulate.transmitter import light_spread
 from rxcli.profiles import ScreenProfile, load_profile
 
@@ -88,10 +88,10 @@ def test_lagging_light_decays_exponentially(length: float, decay: float) -> None
         light.append(light[-1] + (slots[step // fine] - light[-1]) / (decay * fine))
     begin, n = np.rint(starts * fine).astype(int), round(length * fine)
     means = [np.mean(light[b : b + n]) for b in begin]
-    shares = lagging_share(slots, starts, length, decay, 0.0)
+    shares = lit_share(slots, starts, length, decay, 0.0)
     np.testing.assert_allclose(shares, means, atol=2e-3)
     np.testing.assert_allclose(slot_shares(starts, length, np.arange(60.0), decay) @ slots, shares, atol=1e-9)
-    steady = lagging_share(np.ones(60, np.uint8), starts, length, decay, 1.0)
+    steady = lit_share(np.ones(60, np.uint8), starts, length, decay, 1.0)
     np.testing.assert_allclose(steady, 1.0)
 
 

@@ -8,7 +8,7 @@ import pytest
 from small_scene import scene
 
 from rxcli.errors import UsageError
-from rxcli.lab.benchmark.trial import Trial, frame_of
+from rxcli.lab.benchmark.trial import Trial
 from rxcli.lab.simulate.capture import prepare
 from rxcli.protocol import hex_to_bits, indices_to_bits
 from rxcli.receiver.receive import receive
@@ -21,8 +21,8 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[FrameResu
     """The taps and results of a short clip that was not compressed."""
     folder = tmp_path_factory.mktemp("taps")
     take = prepare(replace(scene("clip", "sky"), n_frames=5), 1)
-    trials = [Trial(take.frame(number, threads=1), number) for number in range(5)]
-    frames = [replace(frame_of(t.capture, n), source="a clip.mp4", time_s=n / 30) for n, t in enumerate(trials)]
+    trials = [Trial(take.frame(number, threads=1)) for number in range(5)]
+    frames = [replace(t.frame, source="a clip.mp4", time_s=n / 30) for n, t in enumerate(trials)]
     return folder, list(receive(frames, trials[0].options(), taps_writer(folder)))
 
 

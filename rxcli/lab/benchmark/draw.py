@@ -16,7 +16,7 @@ import numpy as np
 
 from rxcli.lab.benchmark.cases import Case
 from rxcli.lab.benchmark.media import Medium, camera_path
-from rxcli.lab.benchmark.trial import Trial, known_options, write_still
+from rxcli.lab.benchmark.trial import Trial, known_options
 from rxcli.lab.simulate.capture import Recording, prepare
 from rxcli.lab.simulate.files import Encoding, write_video
 from rxcli.lab.simulate.no_data import STRIPED_KINDS, draw_kind, no_data_scene
@@ -121,10 +121,12 @@ def recorded(
     photos = photos or scene.n_frames == 1
     with TemporaryDirectory() as folder:
         frames = (recording.frame(n, oracle=at.oracle, threads=1) for n in range(scene.n_frames if photos else 0))
-        trials = [Trial(frame, frame.frame) for frame in frames]
-        paths = [write_still(trial.capture, Path(folder) / str(trial.index)) for trial in trials]
+        trials = [Trial(frame) for frame in frames]
+        suffix = ".dng" if scene.is_mosaic else ".jpg"
+        paths = [Path(folder) / f"{trial.capture.frame}{suffix}" for trial in trials] or [Path(folder) / "0.mp4"]
+        for trial, path in zip(trials, paths, strict=False):
+            trial.capture.write(path, "dng" if scene.is_mosaic else "jpeg")
         if not photos:
-            paths = [Path(folder) / "0.mp4"]
             write_video(recording.pictures(), paths[0], encoding, scene.frame_rate_hz, scene.orientation)
         about = {"screen": scene.screen.name, "camera": scene.camera_name, "rows_per_slot": scene.rows_per_slot}
         known: dict[str, Any] = {"truth": msgspec.convert(whole, Truth, str_keys=True), "whole_truth": whole}

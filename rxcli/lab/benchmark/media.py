@@ -1,5 +1,6 @@
 """Files of full size that receptions are timed on, and their bare decode, which the times are compared with."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,9 +14,11 @@ import simplejpeg
 from rxcli.ingest.sniff import HEAD_BYTES, read_bytes, sniff
 from rxcli.lab.simulate.capture import prepare, write_capture
 from rxcli.lab.simulate.scenes import Scene, preset
-from rxcli.lab.simulate.truth import build_camera_profile, write_truth
+from rxcli.lab.simulate.truth import build_camera_profile
+from rxcli.outputs import write_whole
 from rxcli.profiles import dump_profile
 from rxcli.protocol import payload_bits
+from rxcli.results.truth import truth_path
 
 #: Width of what fills a photograph, in widths of it.
 _BEYOND_EDGES = 1.6
@@ -95,7 +98,7 @@ def write_known(scene: Scene, path: Path, seed: int, bit_rate: int | None = None
     file_format = {".jpg": "jpeg", ".dng": "dng", ".mp4": "h264"}[path.suffix]
     recording = prepare(replace(scene, output="raw" if file_format == "dng" else "developed"), seed)
     write_capture(recording, path, file_format, bit_rate)
-    write_truth(recording.truth(path.name), path)
+    write_whole(truth_path(path), json.dumps(recording.truth(path.name), indent=1) + "\n")
     profile = build_camera_profile(recording.scene, recording.exposure())
     camera_path(path).write_text(dump_profile(profile), encoding="utf-8")
 

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -10,12 +9,10 @@ import numpy as np
 
 from rxcli.lab.simulate.camera import Exposure
 from rxcli.lab.simulate.capture import Capture, simulate_frame
-from rxcli.lab.simulate.files import write_dng
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.truth import build_camera_profile
 from rxcli.options import ReceiverOptions
-from rxcli.outputs import write_whole
 from rxcli.profiles import CameraProfile
 from rxcli.results.truth import Truth
 from rxcli.types import FloatArray, Frame, Metadata, Mosaic
@@ -29,12 +26,18 @@ class Trial:
     """A simulated frame as the receiver is given it, with what the simulator knows of it."""
 
     capture: Capture
-    index: int = 0
 
     @cached_property
     def frame(self) -> Frame:
-        """The frame, as an ingest stage would hand it on."""
-        return frame_of(self.capture, self.index)
+        """The frame, as an ingest stage would hand it on: the luma of its JPEG, or its mosaic."""
+        scene, sensor, mosaic = self.capture.scene, self.capture.scene.sensor, None
+        exposure_s, orientation = scene.exposure_s, scene.orientation
+        metadata = Metadata(make=scene.make, model=scene.model, exposure_s=exposure_s, orientation=orientation)
+        if scene.is_mosaic and sensor.pattern is not None:
+            red, green, blue = sensor.response
+            black, gains = (float(sensor.black_level),) * 3, (green / red, 1.0, green / blue)
+            mosaic = Mosaic(pattern=sensor.pattern, gains=gains, black=black, white=float(sensor.white_level))
+        return Frame(self.capture.pixels, SOURCE, self.capture.frame, metadata=metadata, mosaic=mosaic)
 
     @cached_property
     def camera(self) -> CameraProfile:
@@ -61,15 +64,6 @@ def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False) -> Trial:
     return Trial(simulate_frame(scene, np.random.default_rng(seed), oracle=oracle, threads=1))
 
 
-def write_still(capture: Capture, stem: Path) -> Path:
-    """Write a photograph as a JPEG or DNG of this stem; returns where."""
-    if capture.scene.is_mosaic:
-        write_dng(capture.raw, capture.scene, path := stem.with_name(stem.name + ".dng"))
-    else:
-        write_whole(path := stem.with_name(stem.name + ".jpg"), capture.jpeg)
-    return path
-
-
 def known_options(exposure: Exposure) -> ReceiverOptions:
     """Options that name screen, corners, and the camera as a perfect calibration would know it."""
     scene = exposure.scene
@@ -84,14 +78,3 @@ def corrected_corners(view: View) -> FloatArray:
     """(4, 2) corners of the screen on a picture whose distortion was corrected in the camera."""
     matrix = view.camera_matrix
     return np.asarray(view.pixels_to_ideal(view.corners) * matrix[[0, 1], [0, 1]] + matrix[:2, 2])
-
-
-def frame_of(capture: Capture, index: int = 0) -> Frame:
-    """A capture as a frame: the luma of its JPEG, or its mosaic."""
-    scene, sensor, mosaic = capture.scene, capture.scene.sensor, None
-    metadata = Metadata(make=scene.make, model=scene.model, exposure_s=scene.exposure_s, orientation=scene.orientation)
-    if scene.is_mosaic and sensor.pattern is not None:
-        red, green, blue = sensor.response
-        black, gains = (float(sensor.black_level),) * 3, (green / red, 1.0, green / blue)
-        mosaic = Mosaic(pattern=sensor.pattern, gains=gains, black=black, white=float(sensor.white_level))
-    return Frame(pixels=capture.pixels, source=SOURCE, index=index, metadata=metadata, mosaic=mosaic)

@@ -36,7 +36,7 @@ def bound_result(trial: Trial) -> FrameResult:
     for column, w in enumerate(truth.w):
         decisions = [oracle.decide(column, burst.burst) for burst in truth.frames[0].bursts]
         columns.append((w, tuple(_packet(decided, w) for decided, _, observed in decisions if observed.all())))
-    return _result(columns, trial.index)
+    return _result(columns, trial)
 
 
 def paper_result(trial: Trial) -> FrameResult:
@@ -48,7 +48,7 @@ def paper_result(trial: Trial) -> FrameResult:
     waves, rows_per_slot = column_waves(trial)
     lit = threshold(waves, rows_per_slot)
     screen = trial.capture.scene.screen
-    return _result([(None, tuple(_between_headers(row, rows_per_slot, screen))) for row in lit], trial.index)
+    return _result([(None, tuple(_between_headers(row, rows_per_slot, screen))) for row in lit], trial)
 
 
 def column_waves(trial: Trial) -> tuple[FloatArray, float]:
@@ -135,9 +135,9 @@ def _packet(index: NDArray[np.int64], w: int) -> PacketResult:
     return PacketResult(0.0, 1.0, payload_bits(w, index.size), payload, confidence=0.0, ber_hat=0.0)
 
 
-def _result(columns: Sequence[tuple[int | None, tuple[PacketResult, ...]]], index: int) -> FrameResult:
+def _result(columns: Sequence[tuple[int | None, tuple[PacketResult, ...]]], trial: Trial) -> FrameResult:
     results = [
         ColumnResult(column, "ok" if packets else "no_packet", w=w, packets=packets, message="none found")
         for column, (w, packets) in enumerate(columns)
     ]
-    return FrameResult(SOURCE, index, 0.0, "ok", columns=tuple(results))
+    return FrameResult(SOURCE, trial.capture.frame, 0.0, "ok", columns=tuple(results))

@@ -7,8 +7,6 @@ gain `a` and noise variance `v`: the log-likelihood is `Q m - P m^2 / 2`, with `
 Where a part of the red light lags, it has a share and a gain of its own: `m` and `Q` are pairs, `P` is a matrix.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,15 +16,20 @@ from rxcli.lab.simulate.shutter import slot_shares
 from rxcli.protocol import PREAMBLE_SLOTS, SLOTS_PER_SYMBOL, codebook
 
 
-@dataclass(frozen=True)
 class Oracle:
-    """Sufficient statistics of one frame's sensor values, and the truth that the genie knows."""
+    """Sufficient statistics of one frame's sensor values, gathered as its bands are read, and what the genie knows.
 
-    exposure: Exposure
-    #: (kinds, kinds, height, columns) `P`: information on the lit share of each row's exposure, by kind of light.
-    information: FloatArray
-    #: (kinds, height, columns) `Q` of the noise alone: all light taken off.
-    noise: FloatArray
+    Args:
+        exposure: the truth.
+    """
+
+    def __init__(self, exposure: Exposure) -> None:
+        shape = (len(exposure.decays), exposure.scene.sensor.height, exposure.link.screen.columns)
+        self.exposure = exposure
+        #: (kinds, kinds, height, columns) `P`: information on the lit share of each row's exposure, by kind of light.
+        self.information: FloatArray = np.zeros((shape[0], *shape))
+        #: (kinds, height, columns) `Q` of the noise alone: all light taken off.
+        self.noise: FloatArray = np.zeros(shape)
 
     def about_slots(self, column: int, start_slot: int) -> tuple[FloatArray, FloatArray]:
         """What the sensor holds about the ten slots of a symbol that begins at slot `start_slot`.
@@ -64,18 +67,9 @@ class Oracle:
             information[symbol] += np.trace(own)
         return np.argmax(score, axis=1), np.argmax(words @ sent.T, axis=0), information > 0
 
-
-class OracleRecorder:
-    """Gathers an `Oracle` while bands are read out."""
-
-    def __init__(self, exposure: Exposure) -> None:
-        shape = (len(exposure.decays), exposure.scene.sensor.height, exposure.link.screen.columns)
-        self._exposure = exposure
-        self._information, self._noise = np.zeros((shape[0], *shape)), np.zeros(shape)
-
     def visit(self, band: Band, electrons: Float32Array) -> None:
         """Take in one band of expected and read electrons."""
-        sensor, pitch = self._exposure.scene.sensor, self._exposure.grid_pitch
+        sensor, pitch = self.exposure.scene.sensor, self.exposure.grid_pitch
         mean = band.mean_e
         variance = mean + np.float32(sensor.read_noise_e**2) + (np.float32(sensor.prnu) * mean) ** 2
         noise = electrons - mean
@@ -87,19 +81,15 @@ class OracleRecorder:
         gain_noise = np.stack([_cells(a * noise / variance, pitch) for a in band.pictures])
         gain2 = np.stack([[_cells(a * b / variance, pitch) for b in band.pictures] for a in band.pictures])
         x = grid_nodes(sensor.width, pitch)[1:-1]
-        step = self._exposure.grid_rows
+        step = self.exposure.grid_rows
         # The columns' light hardly changes over a cell of the grid: its value in the middle stands for all its rows.
         middles = band.top + np.arange(0, mean.shape[0], step, dtype=np.float64) + (step - 1) / 2
-        light = column_light(self._exposure, x, middles, self._exposure.drive).astype(np.float64)
+        light = column_light(self.exposure, x, middles, self.exposure.drive).astype(np.float64)
         for number, own in enumerate(light):
             part = slice(number * step, min((number + 1) * step, mean.shape[0]))
             rows = slice(band.top + part.start, band.top + part.stop)
-            self._information[:, :, rows] = gain2[:, :, part] @ (own**2).T
-            self._noise[:, rows] = gain_noise[:, part] @ own.T
-
-    def finish(self) -> Oracle:
-        """The oracle of the frame that was visited."""
-        return Oracle(self._exposure, self._information, self._noise)
+            self.information[:, :, rows] = gain2[:, :, part] @ (own**2).T
+            self.noise[:, rows] = gain_noise[:, part] @ own.T
 
 
 def _cells(values: NDArray[np.floating], pitch: int) -> FloatArray:

@@ -20,7 +20,7 @@ from rxcli.lab.simulate.motion import HandMotion, turned, turned_back
 from rxcli.lab.simulate.optics import CORNERS, Float32Array, FloatArray, View, between_nodes, grid_nodes, project
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.sensor import count_electrons, pick_colours, repeat_gains, to_raw
-from rxcli.lab.simulate.shutter import flicker, lagging_share, lit_share
+from rxcli.lab.simulate.shutter import flicker, lit_share
 from rxcli.lab.simulate.transmitter import Drive, Link, light_spread
 
 #: Pitch of the coarse grid in rows, and rows of one band of work (a multiple of it).
@@ -169,10 +169,10 @@ class Exposure:
     def _lit(self, first_slot: int, slots: NDArray[Any]) -> tuple[FloatArray, ...]:
         starts = self.row_start_slots - self.delays[:, None] - first_slot
         delayed = list(zip(slots, starts, self.link.weights / 10, strict=True))
-        shares = [[lit_share(column, start, self.exposure_slots) for column, start, _ in delayed]]
-        for decay in self.decays[1:]:
-            shares += [[lagging_share(column, start, self.exposure_slots, decay, w) for column, start, w in delayed]]
-        return tuple(np.stack(columns, axis=1) for columns in shares)
+        return tuple(
+            np.stack([lit_share(column, start, self.exposure_slots, decay, w) for column, start, w in delayed], axis=1)
+            for decay in self.decays
+        )
 
     @cached_property
     def room_rows(self) -> FloatArray:

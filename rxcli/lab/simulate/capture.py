@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rxcli.lab.simulate.bound import Oracle, OracleRecorder
+from rxcli.lab.simulate.bound import Oracle
 from rxcli.lab.simulate.camera import Exposure, take_picture
 from rxcli.lab.simulate.files import CODECS, Encoding, encode_jpeg, write_dng, write_png, write_tiff, write_video
 from rxcli.lab.simulate.film import Film, Player
@@ -63,6 +63,16 @@ class Capture:
 
         return np.asarray(simplejpeg.decode_jpeg(self.jpeg, colorspace="GRAY")[..., 0], np.uint8)
 
+    def write(self, path: Path, file_format: str) -> None:
+        """Write the frame as jpeg, dng, dng14, png, png16, tiff or tiff16."""
+        if file_format == "jpeg":
+            path.write_bytes(self.jpeg)
+        elif file_format.startswith("dng"):
+            write_dng(self.raw, self.scene, path, 14 if file_format == "dng14" else 16)
+        else:
+            rgb = self.developed(16 if file_format.endswith("16") else 8)
+            write_png(rgb, path) if file_format.startswith("png") else write_tiff(rgb, self.scene, path)
+
     @cached_property
     def truth(self) -> dict[str, Any]:
         """The truth of this frame alone, as in `NAME.truth.json`; its frame number is 0."""
@@ -111,10 +121,10 @@ class Recording:
     def frame(self, frame: int = 0, *, oracle: bool = False, threads: int = 2) -> Capture:
         """Take frame number `frame`."""
         exposure = self.exposure(frame)
-        recorder = OracleRecorder(exposure) if oracle else None
+        genie = Oracle(exposure) if oracle else None
         seed = int(np.random.SeedSequence([self.seed, frame]).generate_state(1, np.uint64)[0])
-        raw = take_picture(exposure, seed, threads, recorder.visit if recorder else None)
-        return Capture(self.scene, exposure, frame, raw, recorder.finish() if recorder else None)
+        raw = take_picture(exposure, seed, threads, genie.visit if genie else None)
+        return Capture(self.scene, exposure, frame, raw, genie)
 
     def pictures(self, bits: int = 8, progress: Callable[..., Any] = iter) -> Iterator[NDArray[Any]]:
         """The developed frames of the scene, mixed over time where its camera does so; see `Capture.developed`."""
@@ -227,19 +237,14 @@ def write_capture(
     Args:
         recording: whose frames are written, of a still the first.
         path: of the file.
-        file_format: jpeg, dng, dng14, png, png16, tiff, tiff16, or a codec of `write_video`.
+        file_format: of `Capture.write`, or a codec of `write_video`.
         bit_rate: of clips, bits per second; None for the encoder's constant quality.
         progress: wraps the numbers of the frames.
     """
     scene = recording.scene
     if file_format in CODECS:
-        bits = 16 if CODECS[file_format].bits > 8 else 8
+        bits = 16 if file_format.endswith("-10") else 8
         pictures, encoding = recording.pictures(bits, progress), Encoding(file_format, bit_rate)
         write_video(pictures, path, encoding, scene.frame_rate_hz, scene.orientation)
-    elif file_format == "jpeg":
-        path.write_bytes(recording.frame().jpeg)
-    elif file_format.startswith("dng"):
-        write_dng(recording.frame().raw, scene, path, 14 if file_format == "dng14" else 16)
     else:
-        rgb = recording.frame().developed(16 if file_format.endswith("16") else 8)
-        write_png(rgb, path) if file_format.startswith("png") else write_tiff(rgb, scene, path)
+        recording.frame().write(path, file_format)

@@ -2,7 +2,6 @@
 
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -131,35 +130,16 @@ def write_tiff(rgb: NDArray[np.generic], scene: Scene, path: Path) -> None:
     _append_exif(path, scene)
 
 
-#: FFmpeg's numbers of a colour space and of ranges of luma.
+#: FFmpeg's numbers of a colour space and of ranges of luma: a part of its numbers, or all of them.
 _BT709, _MPEG_RANGE, _JPEG_RANGE = 1, 1, 2
-
-
-@dataclass(frozen=True)
-class Codec:
-    """How a clip is compressed."""
-
-    #: FFmpeg's encoder and pixel format.
-    encoder: str
-    pixel_format: str
-    #: FFmpeg's range of luma: a part or the whole of its numbers.
-    colour_range: int = _MPEG_RANGE
-
-    @property
-    def bits(self) -> int:
-        """Bits of a sample."""
-        return 10 if self.pixel_format.endswith("10le") else 8
-
-
+#: Name of a codec -> FFmpeg's encoder, pixel format and range of luma.
 CODECS = {
-    "h264": Codec("libx264", "yuv420p"),
-    "h264-10": Codec("libx264", "yuv420p10le"),
-    "hevc": Codec("libx265", "yuv420p"),
-    "hevc-10": Codec("libx265", "yuv420p10le"),
-    "mjpeg": Codec("mjpeg", "yuvj420p", _JPEG_RANGE),
+    "h264": ("libx264", "yuv420p", _MPEG_RANGE),
+    "h264-10": ("libx264", "yuv420p10le", _MPEG_RANGE),
+    "hevc": ("libx265", "yuv420p", _MPEG_RANGE),
+    "hevc-10": ("libx265", "yuv420p10le", _MPEG_RANGE),
+    "mjpeg": ("mjpeg", "yuvj420p", _JPEG_RANGE),
 }
-
-
 #: EXIF orientation of a camera held upside down.
 _UPSIDE_DOWN = 3
 
@@ -190,8 +170,8 @@ def write_video(
     Raises:
         UsageError: this machine's FFmpeg lacks the codec, or a side is odd.
     """
-    settings, rate = CODECS[encoding.codec], Fraction(frame_rate_hz).limit_denominator(1001)
-    ranges: dict[str, Any] = {"src_color_range": _JPEG_RANGE, "dst_color_range": settings.colour_range}
+    rate, (_, pixel_format, colour_range) = Fraction(frame_rate_hz).limit_denominator(1001), CODECS[encoding.codec]
+    ranges: dict[str, Any] = {"src_color_range": _JPEG_RANGE, "dst_color_range": colour_range}
     with av.open(str(path), "w") as container:
         stream = None
         for number, rgb in enumerate(frames):
@@ -201,7 +181,7 @@ def write_video(
                     stream.set_display_rotation(180)
             pixels = "rgb24" if rgb.dtype == np.uint8 else "rgb48le"
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), pixels)
-            converted = frame.reformat(format=settings.pixel_format, dst_colorspace=_BT709, **ranges)
+            converted = frame.reformat(format=pixel_format, dst_colorspace=_BT709, **ranges)
             converted.pts, converted.time_base = number, 1 / rate
             container.mux(stream.encode(converted))
         if stream is not None:
@@ -209,22 +189,22 @@ def write_video(
 
 
 def _add_stream(container: Any, encoding: Encoding, rate: Fraction, shape: tuple[int, ...]) -> Any:
-    settings = CODECS[encoding.codec]
+    encoder, pixel_format, colour_range = CODECS[encoding.codec]
     if shape[0] % 2 or shape[1] % 2:
         reason = f"{encoding.codec}: width and height must be even (got {shape[1]} x {shape[0]})"
         raise UsageError(reason, "choose another scale or size")
-    with failure_explained(f"{settings.encoder}: this FFmpeg cannot encode it", "choose another codec", UsageError):
-        stream = container.add_stream(settings.encoder, rate=rate)
+    with failure_explained(f"{encoder}: this FFmpeg cannot encode it", "choose another codec", UsageError):
+        stream = container.add_stream(encoder, rate=rate)
     stream.height, stream.width = shape[:2]
-    stream.pix_fmt = settings.pixel_format
+    stream.pix_fmt = pixel_format
     context = stream.codec_context
-    context.color_range = settings.colour_range
+    context.color_range = colour_range
     context.colorspace = context.color_trc = context.color_primaries = _BT709
     if encoding.bit_rate is not None:
         stream.bit_rate = encoding.bit_rate
-    if settings.encoder != "mjpeg":
+    if encoder != "mjpeg":
         stream.options = {"preset": encoding.preset} | ({} if encoding.bit_rate else {"crf": "23"})
-        if settings.encoder == "libx265":
+        if encoder == "libx265":
             # Reordered frames of a clip shorter than the encoder's delay get times that no container takes; and the
             # encoders in cameras do not reorder either.
             stream.options = stream.options | {"x265-params": "log-level=error:bframes=0"}

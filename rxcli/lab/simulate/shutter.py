@@ -6,15 +6,20 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 
-def lit_share(slots: NDArray[np.uint8], start: FloatArray, length: float) -> FloatArray:
-    """Mean of a slot sequence over exposures.
+def lit_share(
+    slots: NDArray[np.uint8], start: FloatArray, length: float, decay: float = 0.0, level: float = 0.0
+) -> FloatArray:
+    """Mean over exposures of a slot sequence, or of a light that follows it exponentially, as a phosphor does.
 
-    The sequence is piecewise constant, so its running integral is piecewise linear and the mean is exact.
+    The sequence is piecewise constant, so its running integral is piecewise linear and the mean is exact. The light `y`
+    obeys `decay * y' = slot - y`; so its integral is that of the slots less `decay` times its growth.
 
     Args:
         slots: (n,) 0/1, slot `k` lasting from k to k + 1; dark outside.
-        start: (rows,) exposure starts, in slots.
+        start: (rows,) exposure starts, in slots; 0 or more where the light decays.
         length: of every exposure, in slots.
+        decay: time to 1/e, in slots; 0 for light that goes out at once.
+        level: light that decays at the start of slot 0.
 
     Returns:
         (rows,) share of the exposure that was lit, 0..1.
@@ -22,21 +27,9 @@ def lit_share(slots: NDArray[np.uint8], start: FloatArray, length: float) -> Flo
     integral = np.concatenate([[0.0], np.cumsum(slots, dtype=np.float64)])
     knots = np.arange(integral.size, dtype=np.float64)
     lit = np.interp(start + length, knots, integral) - np.interp(start, knots, integral)
-    return np.asarray(np.clip(lit / length, 0.0, 1.0))
-
-
-def lagging_share(slots: NDArray[np.uint8], start: FloatArray, length: float, decay: float, level: float) -> FloatArray:
-    """Mean over exposures of a light that follows a slot sequence exponentially, as a phosphor does.
-
-    The light `y` obeys `decay * y' = slot - y`; so its integral is that of the slots less `decay` times its growth.
-
-    Args:
-        slots: (n,) 0/1, slot `k` lasting from k to k + 1.
-        start: (rows,) exposure starts, in slots, 0 or more.
-        length: of every exposure, in slots.
-        decay: time to 1/e, in slots.
-        level: light at the start of slot 0.
-    """
+    share = np.asarray(np.clip(lit / length, 0.0, 1.0))
+    if not decay:
+        return share
     light = np.empty(slots.size + 1)
     light[0], keep = level, np.exp(-1 / decay)
     for slot, lit in enumerate(slots.tolist()):
@@ -46,11 +39,11 @@ def lagging_share(slots: NDArray[np.uint8], start: FloatArray, length: float, de
         slot = np.minimum(time.astype(np.int64), slots.size - 1)
         return np.asarray(slots[slot] + (light[slot] - slots[slot]) * np.exp((slot - time) / decay))
 
-    return lit_share(slots, start, length) - decay / length * (light_at(start + length) - light_at(start))
+    return share - decay / length * (light_at(start + length) - light_at(start))
 
 
 def slot_shares(start: FloatArray, length: float, slots: FloatArray, decay: float = 0.0) -> FloatArray:
-    """(rows, n) what one lit slot adds to the mean of every exposure, at once or decaying; see `lagging_share`.
+    """(rows, n) what one lit slot adds to the mean of every exposure, at once or decaying; see `lit_share`.
 
     Args:
         start: (rows,) exposure starts, in slots.

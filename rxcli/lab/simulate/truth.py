@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 
-from rxcli.outputs import write_whole
 from rxcli.profiles import CameraProfile, LensModel, ReadoutMode
 from rxcli.protocol import bits_to_hex
 
@@ -92,15 +89,3 @@ def build_camera_profile(scene: Scene, exposure: Exposure) -> CameraProfile:
     named: dict[str, Any] = {"name": scene.camera_name, "make": scene.make, "models": (scene.model,)}
     about = f"written by {_AUTHOR}"
     return CameraProfile(format=1, kind="camera", **named, modes=(mode,), lens=model, description=about)
-
-
-def write_truth(truth: dict[str, Any], path: Path) -> Path:
-    """Write the truth beside the capture `path`, as `NAME.truth.json`; returns where."""
-    target = truth_path(path)
-    write_whole(target, json.dumps(truth, indent=1) + "\n")
-    return target
-
-
-def truth_path(path: Path) -> Path:
-    """Where the truth of the capture `path` is written."""
-    return path.with_name(path.stem + ".truth.json")
