@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rxcli.lab.simulate.camera import render_band
-from rxcli.lab.simulate.capture import prepare, simulate_frame
+from rxcli.lab.simulate.capture import prepare
 from rxcli.lab.simulate.isp import Isp, correction_map, develop, local_gain, tone_curve
 from rxcli.lab.simulate.optics import Lens, Pose, View, distort, undistort
 from rxcli.lab.simulate.scenes import Scene, preset
@@ -197,10 +197,10 @@ def test_blur_keeps_the_pictures_light(small: Scene) -> None:
 
 def test_same_seed_same_pixels_whatever_threads_and_order(small: Scene) -> None:
     scene = replace(small, n_frames=3, hand_px=2.0)
-    one, two = simulate_frame(scene, 7, threads=1), simulate_frame(scene, 7, threads=2)
+    one, two = prepare(scene, 7).frame(threads=1), prepare(scene, 7).frame(threads=2)
     np.testing.assert_array_equal(one.raw, two.raw)
     assert (one.truth, one.jpeg) == (two.truth, two.jpeg)
-    assert (simulate_frame(scene, 8).raw != one.raw).any()
+    assert (prepare(scene, 8).frame().raw != one.raw).any()
     take = prepare(scene, 7)
     last = take.frame(2).raw
     np.testing.assert_array_equal(take.frame(0).raw, one.raw)

@@ -21,7 +21,7 @@ from rxcli.cli.simulate import simulate
 from rxcli.errors import ReceiverError, UsageError
 from rxcli.ingest import open_source
 from rxcli.lab.simulate.camera import render_band
-from rxcli.lab.simulate.capture import prepare, simulate_frame
+from rxcli.lab.simulate.capture import prepare
 from rxcli.lab.simulate.files import Encoding, write_dng, write_video
 from rxcli.lab.simulate.scenes import PRESETS, Scene, preset
 from rxcli.protocol import codebook
@@ -82,7 +82,7 @@ def test_dng_opens_bit_exact(small: Scene, tmp_path: Path, cfa: str, bits: int) 
 
 
 def test_jpeg_carries_what_a_camera_writes(small: Scene) -> None:
-    capture = simulate_frame(replace(small, orientation=3, iso=800), 1)
+    capture = prepare(replace(small, orientation=3, iso=800), 1).frame()
     with Image.open(io.BytesIO(capture.jpeg)) as picture:
         exif = picture.getexif()
         assert picture.size == (small.sensor.width, small.sensor.height)
@@ -93,7 +93,7 @@ def test_jpeg_carries_what_a_camera_writes(small: Scene) -> None:
 
 def test_truth_counts_the_slots_between_the_corners(small: Scene) -> None:
     scene = replace(small, start_slot=500.0)
-    truth = simulate_frame(scene, 1).truth
+    truth = prepare(scene, 1).frame().truth
     heights = np.array(truth["corners_sensor_px"])[:, 1]
     slots = (heights.max() - heights.min()) * scene.sensor.line_delay_s * 34600
     bursts = truth["frames"][0]["bursts"]
@@ -141,7 +141,7 @@ def test_the_bound_meets_theory_at_moderate_light() -> None:
     wrong = total = 0
     expected = []
     for seed in range(5):
-        oracle = simulate_frame(scene, seed, oracle=True).oracle
+        oracle = prepare(scene, seed).frame(oracle=True).oracle
         for column in range(20):
             decided, sent, seen = oracle.decide(column, 0)
             wrong, total = wrong + int((decided != sent)[seen].sum()), total + int(seen.sum())
@@ -162,7 +162,7 @@ def test_the_bound_counts_all_that_a_slot_does_to_the_sensor(exposure_slots: flo
     sensor = replace(base.sensor, cfa="rgb", row_noise_e=0.0)
     scene = replace(base, screen=screen, sensor=sensor, picture="gradient", start_slot=300.0, red_lag_s=red_lag_s)
     scene = replace(scene, exposure_s=exposure_slots / screen.slot_rate_hz)
-    oracle = simulate_frame(scene, 1, oracle=True).oracle
+    oracle = prepare(scene, 1).frame(oracle=True).oracle
 
     def mean_e(**changes: Any) -> np.ndarray:
         exposure = prepare(replace(scene, **changes), 1).exposure()

@@ -277,14 +277,11 @@ def worth_a_look(records: Sequence[Record], ways: Sequence[str]) -> list[Row]:
         for way in ways:
             group = Group([record], way, way)
             if group.wrong() or group.problems or (group.packets and not record["has_data"]):
-                facts = " ".join(f"{key} {_rounded(value)}" for key, value in record["about"].items())
+                about = record["about"].items()
+                facts = " ".join(f"{key} {round(x, 3) if isinstance(x, float) else x}" for key, x in about)
                 row = {"scene": facts, "way": way, "packets": len(group.packets), "surely_wrong": group.wrong()}
                 table.append({**row, "problems": "; ".join(group.problems)})
     return table
-
-
-def _rounded(value: Any) -> Any:
-    return round(value, 3) if isinstance(value, float) else value
 
 
 def passes(records: Sequence[Record], ways: Sequence[str]) -> bool:

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from rxcli.lab.simulate.camera import Exposure
-from rxcli.lab.simulate.capture import Capture, simulate_frame
+from rxcli.lab.simulate.capture import Capture, prepare
 from rxcli.lab.simulate.optics import View
 from rxcli.lab.simulate.scenes import Scene
 from rxcli.lab.simulate.truth import build_camera_profile
@@ -61,7 +61,7 @@ class Trial:
 
 def simulate_trial(scene: Scene, seed: int, *, oracle: bool = False) -> Trial:
     """Simulate one frame of `scene`; equal seeds give equal pixels."""
-    return Trial(simulate_frame(scene, np.random.default_rng(seed), oracle=oracle, threads=1))
+    return Trial(prepare(scene, seed).frame(oracle=oracle, threads=1))
 
 
 def known_options(exposure: Exposure) -> ReceiverOptions:

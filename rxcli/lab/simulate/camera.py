@@ -19,7 +19,7 @@ from rxcli.lab.simulate.film import Player
 from rxcli.lab.simulate.motion import HandMotion, turned, turned_back
 from rxcli.lab.simulate.optics import CORNERS, Float32Array, FloatArray, View, between_nodes, grid_nodes, project
 from rxcli.lab.simulate.scenes import Scene
-from rxcli.lab.simulate.sensor import count_electrons, pick_colours, repeat_gains, to_raw
+from rxcli.lab.simulate.sensor import count_electrons, pick_colours, to_raw
 from rxcli.lab.simulate.shutter import flicker, lit_share
 from rxcli.lab.simulate.transmitter import Drive, Link, light_spread
 
@@ -290,18 +290,15 @@ def column_light(exposure: Exposure, x: FloatArray, y: FloatArray, drive: Drive)
     screen = exposure.link.screen
     pixels = np.stack(np.meshgrid(x, y), axis=-1)
     place, share = exposure.lit_places(pixels)
-    gain = exposure.scene.light_e_per_s * exposure.scene.exposure_s * _vignette(exposure, pixels) * share
+    half = np.array([exposure.scene.sensor.width, exposure.scene.sensor.height]) / 2
+    radius2 = (((pixels - half) / half) ** 2).sum(axis=-1) / 2
+    vignette = 1 - exposure.scene.vignetting * radius2
+    gain = exposure.scene.light_e_per_s * exposure.scene.exposure_s * vignette * share
     widths = screen.light_spread, exposure.scene.spread_tails
     along = light_spread(place[..., 1], screen.segment_rows, *widths) @ drive.lit_light
     along *= light_spread(place[..., 0], screen.columns, *widths)
     along *= gain[..., None]
     return np.ascontiguousarray(along.transpose(0, 2, 1), np.float32)
-
-
-def _vignette(exposure: Exposure, pixels: FloatArray) -> FloatArray:
-    half = np.array([exposure.scene.sensor.width, exposure.scene.sensor.height]) / 2
-    radius2 = (((pixels - half) / half) ** 2).sum(axis=-1) / 2
-    return np.asarray(1 - exposure.scene.vignetting * radius2)
 
 
 @dataclass(frozen=True)
@@ -414,7 +411,6 @@ def take_picture(
     sensor = exposure.scene.sensor
     shape = (sensor.height, sensor.width) if sensor.pattern is not None else (sensor.height, sensor.width, 3)
     raw = np.empty(shape, np.uint16)
-    gains = sensor.pixel_gains()
     # Shared by all bands: made once, before threads ask for them.
     _ = exposure.textures, exposure.lit_by_drive, exposure.room_rows, exposure.grid_pitch, exposure.grid_rows
     _ = exposure.glare_rows if exposure.scene.glare else None
@@ -422,7 +418,7 @@ def take_picture(
     def work(rows: tuple[int, int]) -> None:
         band = render_band(exposure, *rows)
         rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence([seed, rows[0]])))
-        mean = band.mean_e * repeat_gains(gains, rows[0], band.mean_e.shape)
+        mean = band.mean_e * sensor.pixel_gains(rows[0], band.mean_e.shape)
         electrons = count_electrons(mean, sensor, rng)
         raw[rows[0] : rows[1]] = to_raw(electrons, sensor)
         if visit is not None:

@@ -217,18 +217,6 @@ def _delays(scene: Scene, rng: np.random.Generator) -> FloatArray:
     return drawn * scene.column_delay_slots
 
 
-def simulate_frame(scene: Scene, rng: np.random.Generator | int, *, oracle: bool = False, threads: int = 2) -> Capture:
-    """Simulate the first frame of a scene.
-
-    Args:
-        scene: what to simulate.
-        rng: source of randomness, or a seed; equal ones give equal pixels.
-        oracle: also record what the genie-aided bound needs.
-        threads: bands of rows computed at the same time; the pixels do not depend on it.
-    """
-    return prepare(scene, rng).frame(oracle=oracle, threads=threads)
-
-
 def write_capture(
     recording: Recording, path: Path, file_format: str, bit_rate: int | None = None, progress: Callable[..., Any] = iter
 ) -> None:

@@ -69,9 +69,11 @@ class Sensor:
         """Unit cell of the colour filter array, None for "rgb"."""
         return PATTERNS.get(self.cfa)
 
-    def pixel_gains(self) -> Float32Array:
-        """(tile, tile) gains of the pixels; the same for every picture of this sensor."""
-        return 1 + np.float32(self.prnu) * _gain_tile()
+    def pixel_gains(self, first_row: int, shape: tuple[int, ...]) -> Float32Array:
+        """Gains of the pixels of `shape[0]` rows from `first_row` on; the same for every picture of this sensor."""
+        gains = 1 + np.float32(self.prnu) * _gain_tile()[(first_row + np.arange(shape[0])) % _GAIN_TILE]
+        wide = np.tile(gains, (1, -(-shape[1] // _GAIN_TILE)))[:, : shape[1]]
+        return wide if len(shape) == 2 else wide[..., None]
 
 
 @lru_cache(maxsize=1)
@@ -102,14 +104,6 @@ def pick_colours(planes: Float32Array, pattern: NDArray[np.uint8] | None, first_
         for x in range(width):
             mosaic[y::height, x::width] = planes[y::height, x::width, pattern[(y + first_row) % height, x]]
     return mosaic
-
-
-def repeat_gains(gains: Float32Array, first_row: int, shape: tuple[int, ...]) -> Float32Array:
-    """Pixel gains of `shape[0]` rows from `first_row` on, repeated from the tile `gains`."""
-    rows = (first_row + np.arange(shape[0])) % gains.shape[0]
-    times = -(-shape[1] // gains.shape[1])
-    wide = np.tile(gains[rows], (1, times))[:, : shape[1]]
-    return wide if len(shape) == 2 else wide[..., None]
 
 
 def count_electrons(mean_e: Float32Array, sensor: Sensor, rng: np.random.Generator) -> Float32Array:

@@ -150,13 +150,16 @@ def _thinned(sample: Sample, rng: np.random.Generator) -> Sample:
     return replace(sample, strips=sample.strips[:, left])
 
 
+#: Step, and cross-entropy of a word in training and on held-out samples (nan of none), natural logarithm.
+History = list[tuple[int, float, float]]
+
+
 @dataclass(frozen=True)
 class Fitted:
     """A network, its weights averaged over the last steps, and how its loss went."""
 
     network: StripNetwork
-    #: Step, and cross-entropy of a word in training and on held-out samples (nan of none), natural logarithm.
-    history: list[tuple[int, float, float]]
+    history: History
 
 
 def fit(
@@ -184,8 +187,9 @@ def fit(
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, recipe.learning_rate, total_steps=recipe.steps + 1, pct_start=0.1
     )
-    checkpoint = _Checkpoint(folder, recipe, len(samples), (network, averaged, optimiser, schedule))
-    history = checkpoint.restore()
+    parts, checkpoint = (network, averaged, optimiser, schedule), folder / "checkpoint.pt"
+    key = f"{recipe} {len(samples)} samples"
+    history = _restored(parts, checkpoint, key)
     start, running = history[-1][:2] if history else (0, float("nan"))
     for step in tqdm(range(start + 1, recipe.steps + 1), disable=not progress, unit="step"):
         loss = _drawn_loss(network, samples, np.random.default_rng([recipe.seed, step]))
@@ -198,42 +202,27 @@ def fit(
         running = loss.item() if np.isnan(running) else 0.98 * running + 0.02 * loss.item()
         if step % _CHECKPOINT_EVERY == 0 or step == recipe.steps:
             history.append((step, running, mean_loss(averaged.module, validation)))
-            checkpoint.save(history)
+            _store(parts, checkpoint, key, history)
     _plot_loss(history, folder / "loss.png")
     return Fitted(averaged.module.eval(), history)
 
 
-@dataclass(frozen=True)
-class _Checkpoint:
-    """State of a fit in a folder."""
+def _store(parts: Sequence[Any], path: Path, key: str, history: History) -> None:
+    """Write the state of network, optimiser and all else that has one, and the losses so far."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    state, hidden = [each.state_dict() for each in parts], path.with_suffix(".part")
+    torch.save({"fit": key, "history": history, "parts": state}, hidden)
+    hidden.replace(path)
 
-    folder: Path
-    recipe: Recipe
-    n_samples: int
-    #: Network, optimiser and all else that has a state.
-    parts: tuple[Any, ...]
 
-    @property
-    def _key(self) -> str:
-        """Recipe and amount of data; a stored state of another key is not restored."""
-        return f"{self.recipe} {self.n_samples} samples"
-
-    def save(self, history: list[tuple[int, float, float]]) -> None:
-        """Write the state of all parts, and the losses so far."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        part = self.folder / "checkpoint.part"
-        torch.save({"fit": self._key, "history": history, "parts": [each.state_dict() for each in self.parts]}, part)
-        part.replace(self.folder / "checkpoint.pt")
-
-    def restore(self) -> list[tuple[int, float, float]]:
-        """Restore the parts; return the losses so far, none if the folder has no checkpoint of this fit."""
-        path = self.folder / "checkpoint.pt"
-        stored = torch.load(path, weights_only=True) if path.exists() else {}
-        if stored.get("fit") != self._key:
-            return []
-        for part, state in zip(self.parts, stored["parts"], strict=True):
-            part.load_state_dict(state)
-        return list(stored["history"])
+def _restored(parts: Sequence[Any], path: Path, key: str) -> History:
+    """Restore the parts and return the losses so far; none if `path` is no checkpoint of this recipe and data."""
+    stored = torch.load(path, weights_only=True) if path.exists() else {}
+    if stored.get("fit") != key:
+        return []
+    for part, state in zip(parts, stored["parts"], strict=True):
+        part.load_state_dict(state)
+    return list(stored["history"])
 
 
 def _moving_average(averaged: Tensor, current: Tensor, n_averaged: Tensor) -> Tensor:
@@ -249,7 +238,7 @@ def mean_loss(network: StripNetwork, samples: Sequence[Sample]) -> float:
     return float(np.mean(losses)) if losses else float("nan")
 
 
-def _plot_loss(history: Sequence[tuple[int, float, float]], path: Path) -> None:
+def _plot_loss(history: History, path: Path) -> None:
     """Training and validation loss over the steps, as a picture."""
     steps, *losses = np.array(history, np.float64).T
 
