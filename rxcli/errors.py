@@ -11,26 +11,19 @@ from enum import IntEnum
 
 
 class ExitCode(IntEnum):
-    """Exit codes of every command."""
+    """Exit codes of every command, in order of precedence."""
 
     OK = 0
     NOT_RECEIVED = 1
-    USAGE = 2
     UNREADABLE = 3
+    USAGE = 2
     INTERRUPTED = 130
     TERMINATED = 143
 
 
-#: Precedence of exit codes, highest first.
-_PRECEDENCE = (
-    *(ExitCode.TERMINATED, ExitCode.INTERRUPTED),
-    *(ExitCode.USAGE, ExitCode.UNREADABLE, ExitCode.NOT_RECEIVED, ExitCode.OK),
-)
-
-
 def worst(codes: list[ExitCode]) -> ExitCode:
     """Exit code of a run in which each of `codes` occurred."""
-    return next((code for code in _PRECEDENCE if code in codes), ExitCode.OK)
+    return max(codes, key=list(ExitCode).index, default=ExitCode.OK)
 
 
 #: Clauses that only apply to a command line.

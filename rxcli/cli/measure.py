@@ -44,13 +44,8 @@ def measure(path: Path, frame: int, axis: str, picture: Path | None, force: bool
 
     It needs stripes: a rolling shutter and a short exposure. Without the camera's timing, ratios are printed.
     """
-    refuse(
-        (
-            sum(given[name] is not None for name in ("camera", "line_delay_s", "readout_s")) > 1,
-            "--camera, --line-delay and --readout all state the camera's timing",
-            "give one of them",
-        )
-    )
+    n_stated = sum(given[name] is not None for name in ("camera", "line_delay_s", "readout_s"))
+    refuse((n_stated > 1, "--camera, --line-delay and --readout all state the camera's timing", "give one of them"))
     json_path = given["json_path"]
     drawn = output("--picture", picture, PICTURE)
     claim([json_output(json_path, "axis", "lamps"), drawn], [path], (given["camera"],), force)

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rxcli.cli.common import options, receiver_arguments, receiver_options
+from rxcli.cli.common import options, receiver_arguments, receiver_options, refuse
 from rxcli.cli.kinds import FOLDER, Exposure
-from rxcli.errors import ExitCode, UsageError, require
+from rxcli.errors import ExitCode, require
 
 if TYPE_CHECKING:
     from rxcli.web.server import Site
@@ -48,16 +48,15 @@ def _site(device: Path | None, options: dict[str, Any]) -> Site:
     from rxcli.ingest.v4l2 import CameraSettings
     from rxcli.web.server import Bounds, Site
 
-    if options["proxy"] and not options["proxy"].startswith(("http://", "https://")):
-        raise UsageError(
-            f"--proxy {options['proxy']!r} is no address", "name all of it, such as https://lab.example.org"
-        )
+    proxy, step = options["proxy"], "name all of it, such as https://lab.example.org"
+    is_part = proxy and not proxy.startswith(("http://", "https://"))
+    refuse((is_part, f"--proxy {proxy!r} is no address", step))
     return Site(
         options=receiver_options(options, soft_bits=True),
         host=options["host"] or "127.0.0.1",
         port=options["port"],
         token=secrets.token_urlsafe(12) if options["host"] else None,
-        proxy=options["proxy"],
+        proxy=proxy,
         device=device,
         camera=CameraSettings(exposure_s=options["exposure"], gain=options["gain"], wait=True),
         keep=options["keep"],

@@ -4,7 +4,7 @@ import html
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import Any
 
@@ -68,9 +68,7 @@ def inspection_page(shown: Reception, known: Inspection | None, timeline: Sequen
         and {"corrected": [c.column for c in result.columns if c.denoised], **result.denoiser},
         "times": {name: value for name, value in result.timing_ms.items() if math.isfinite(value)},
         "skipped": result.skipped,
-        "search": [
-            [entry.hypothesis, entry.log_prior, entry.evidence, entry.score, entry.fate] for entry in result.search
-        ],
+        "search": [astuple(step) for step in result.search],
     }
     return fill(data, f"{printable(Path(result.source).name)}: {title.lower()}")
 
