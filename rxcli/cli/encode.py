@@ -93,7 +93,8 @@ def _plan(path: Path | None, screen: ScreenProfile, options: dict[str, Any]) -> 
         is_both = any(value is not None for value in given)
         refuse((is_both, "--payload excludes PATH, --text and --uri", "give one of them"))
         sending = raw_sending(options["payload"], weights, options["seed"], options["same"])
-    n_bursts, n = _n_bursts(options, sending, screen), len(weights)
+    usual, seconds, n = sending.usual_bursts(screen.columns, screen.payload_symbols), options["seconds"], len(weights)
+    n_bursts = options["bursts"] or (ceil(seconds / (screen.packet_s * screen.repeats)) if seconds else usual)
     reason = f"--weights {text} holds {n} bursts, {n_bursts} are sent"
     refuse((n not in (1, n_bursts), reason, f"give {n_bursts}, or --bursts"))
     return _Plan(sending, screen, weights, n_bursts, options["only_column"])
@@ -111,14 +112,6 @@ def _write_slots(plan: _Plan, out: Path, suffix: str) -> None:
 
 def _readme_of(out: Path) -> Path:
     return out.with_name(out.name + ".README.txt")
-
-
-def _n_bursts(options: dict[str, Any], sending: Sending | TestLight, screen: ScreenProfile) -> int:
-    if options["bursts"] is not None:
-        return int(options["bursts"])
-    if options["seconds"] is not None:
-        return max(1, ceil(float(options["seconds"]) / (screen.packet_s * screen.repeats)))
-    return sending.usual_bursts(screen.columns, screen.payload_symbols)
 
 
 def _weights(text: str, columns: int) -> NDArray[np.int64]:

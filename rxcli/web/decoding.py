@@ -104,8 +104,8 @@ class DecodingProcess:
         try:
             self._connection.send((str(path), name, session))
             return self._answer(publish)
-        except _EndedError as ended:
-            reason, step = ended.args
+        except InputError as ended:
+            reason, step = ended.message, ended.hint
         except (EOFError, OSError, ValueError):
             reason, step = "reading it ended the program that reads pictures", "try another picture"
         log.warning("%s: %s", name, reason)
@@ -119,9 +119,9 @@ class DecodingProcess:
             while not self._connection.poll(_POLL_S):
                 if time.monotonic() > end_s:
                     reason = f"nothing was found in {self._max_s:.0f} s, after which the page gives up"
-                    raise _EndedError(reason, "photograph the screen from nearer, or decode the file by `vlc-rx`")
+                    raise InputError(reason, "photograph the screen from nearer, or decode the file by `vlc-rx`")
                 if resident_bytes(self.pid) > self._max_bytes:
-                    raise _EndedError("it takes too much memory", "try a smaller picture")
+                    raise InputError("it takes too much memory", "try a smaller picture")
             answer, n_bytes = receive(self._connection)
             if not answer.get("partial"):
                 return answer
@@ -147,10 +147,6 @@ def receive(connection: Connection) -> tuple[dict[str, Any], int]:
     if not isinstance(answer, dict):
         raise ValueError("no answer")
     return answer, len(data)
-
-
-class _EndedError(Exception):
-    """A limit was exceeded: reason and next step."""
 
 
 def refusal(reason: str, step: str) -> dict[str, Any]:
