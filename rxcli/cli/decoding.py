@@ -14,7 +14,7 @@ from typing import Any
 
 from rxcli import __version__, outputs
 from rxcli.cli.common import output, receiver_options, refuse
-from rxcli.cli.printing import JsonLines, Progress, Table, Writer, print_line, print_text
+from rxcli.cli.printing import Progress, Table, print_line, print_text
 from rxcli.errors import ExitCode, InputError, ReceiverError, failure_explained, worst
 from rxcli.ingest import KNOWN_SUFFIXES, MAX_BYTES, open_source
 from rxcli.link.collector import PhotoCollector
@@ -167,7 +167,7 @@ class _Run:
         self._estimated: FrameResult | None = None
         #: Name of a source -> where it is opened.
         self._paths = {source.name: source.path for source in sources}
-        self._output = Writer()
+        self._output: Table | Lines | None = None
         self._put_payloads: Callable[[Iterable[Iterable[Any]]], None] | None = None
 
     def run(self) -> ExitCode:
@@ -184,11 +184,12 @@ class _Run:
                 self._put_payloads = lambda rows: append(report.csv_text(rows).removesuffix("\n"))
                 self._put_payloads([PAYLOAD_TABLE])
             if path is not None:
-                lines = Lines(self._head(), {name: path for name, path in self._paths.items() if name != STDIN})
+                paths = {name: path for name, path in self._paths.items() if name != STDIN}
+                lines = Lines(print_line if output is None else output.append, self._head(), paths)
                 if output is not None and resume:
                     done = self._recover(output, lines)
                 lines.begun = bool(done)
-                self._output = JsonLines(lines, print_line if output is None else output.append)
+                self._output = lines
             elif not self._given["quiet"]:
                 self._output = Table(self._given["packets"])
             try:
@@ -233,7 +234,8 @@ class _Run:
             for source, results in self._decoded(sources):
                 progress.begin(source.name)
                 with self._summarised(source.name) as (counted, scorer):
-                    self._output.begin(source.name, scorer is not None)
+                    if self._output is not None:
+                        self._output.begin(source.name, scorer is not None)
                     for received, last in batch.with_last(results):
                         result = self._photos.add(scorer.add(received) if scorer else received)
                         if out := self._given["out"]:
@@ -242,11 +244,13 @@ class _Run:
                         self._count(result, counted)
                         self._keep_estimate(result)
                         log.info("%s", report.result_in_words(result))
-                        with progress.hidden():
-                            self._output.write(result, last)
+                        if self._output is not None:
+                            with progress.hidden():
+                                self._output.write(result, last)
                         progress.add(result, last)
-                    with progress.hidden():
-                        self._output.end(counted)
+                    if isinstance(self._output, Table):
+                        with progress.hidden():
+                            self._output.end(counted)
 
     def _decoded(self, sources: list[batch.Source]) -> Iterator[batch.Decoded]:
         if self._given["cluster"]:
@@ -333,9 +337,9 @@ class _Run:
                     name = "" if reason.startswith(f"{counted.source}: ") else f"{counted.source}: "
                     log.error("%s%s", name, reason)
         elif self._summaries:
-            if self._output.has_table:
-                print_text(report.LEGEND + "\n")
             is_shown = isinstance(self._output, Table)
+            if isinstance(self._output, Table) and self._output.has_table:
+                print_text(report.LEGEND + "\n")
             print_text(summary.format_summary(self._summaries, self._limits, is_shown), err=to_stderr)
             for counted in self._summaries:
                 of = f"{report.printable_name(counted.source)}: " if len(self._summaries) > 1 else ""

@@ -5,7 +5,7 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from threading import Event, Lock, Thread
 from typing import Any, Self, TextIO, TypeVar
@@ -14,7 +14,6 @@ import click
 
 from rxcli.results import report
 from rxcli.results.summary import SourceSummary, format_clip
-from rxcli.runs.journal import Lines
 from rxcli.types import FrameResult
 
 _T = TypeVar("_T")
@@ -28,35 +27,22 @@ _COLOURS |= dict.fromkeys(("no_packet", "no_screen", "no_signal", "unreadable"),
 _STATE = re.compile(rf"(?<= \| )({'|'.join(_COLOURS)})(?= \||$)|(?<=\d  )({'|'.join(_COLOURS)})(?=\*? )", re.MULTILINE)
 
 
-class Writer:
-    """Takes the results of one source after the other; this one writes nothing."""
-
-    #: Whether a table was shown, which a legend explains.
-    has_table = False
-
-    def begin(self, source: str, scored: bool) -> None:
-        """A source begins, whose packets are `scored` against the truth."""
-
-    def write(self, result: FrameResult, last: bool) -> None:
-        """The next result of the source."""
-
-    def end(self, summary: SourceSummary) -> None:
-        """The source has ended."""
-
-
-class Table(Writer):
-    """Texts and files first; then a photo's packets as a table, and a clip in one line.
+class Table:
+    """Prints texts and files first; then a photo's packets as a table, and a clip in one line.
 
     Args:
         packets: whether clips have a table, too.
     """
 
+    #: Whether a table was shown, which a legend explains.
+    has_table = False
+
     def __init__(self, packets: bool) -> None:
         self._packets = packets
         self._scored = self._clip = self._has_header = False
 
-    def begin(self, source: str, scored: bool) -> None:
-        """Forget the source before."""
+    def begin(self, _source: str, scored: bool) -> None:
+        """Begin a source, whose packets are `scored` against the truth."""
         self._scored, self._clip, self._has_header = scored, False, False
 
     def write(self, result: FrameResult, last: bool) -> None:
@@ -75,21 +61,6 @@ class Table(Writer):
         """Print the line of a clip."""
         if self._clip:
             print_text(format_clip(summary) + "\n")
-
-
-class JsonLines(Writer):
-    """One JSON object a frame, given to `put`."""
-
-    def __init__(self, lines: Lines, put: Callable[[str], None]) -> None:
-        self._lines, self._put = lines, put
-
-    def begin(self, source: str, scored: bool) -> None:
-        """Name the source."""
-        self._lines.begin(source)
-
-    def write(self, result: FrameResult, last: bool) -> None:
-        """Write the frame's object."""
-        self._put(self._lines.line(result, last))
 
 
 def print_line(line: str) -> None:

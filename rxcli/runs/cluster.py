@@ -7,7 +7,6 @@ import logging
 import os
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -102,9 +101,13 @@ def _connect(address: str, connect_s: float) -> Client:
 
     # A name that is looked up in vain, or a server that accepts and is silent, is left behind with its thread.
     connecting = Thread(target=connect, daemon=True)
-    with _silent():
-        connecting.start()
-        connecting.join(connect_s + _MARGIN_S)
+    logging.disable()  # without the tracebacks that Dask logs of attempts that fail
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            connecting.start()
+            connecting.join(connect_s + _MARGIN_S)
+    finally:
+        logging.disable(logging.NOTSET)
     if not made:
         why = failures[0] if failures else f"nothing within {connect_s:g} s"
         raise UsageError(f"--cluster: no Dask scheduler answers at {address!r} ({why})", _START_ONE)
@@ -112,17 +115,6 @@ def _connect(address: str, connect_s: float) -> Client:
     if not client.scheduler_info()["workers"]:
         log.warning("the scheduler at %s has no workers yet; waiting for some (`dask worker %s`)", address, address)
     return client
-
-
-@contextmanager
-def _silent() -> Iterator[None]:
-    """Without the tracebacks that Dask logs of attempts that fail."""
-    logging.disable()
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            yield
-    finally:
-        logging.disable(logging.NOTSET)
 
 
 class _UnseenError(Exception):

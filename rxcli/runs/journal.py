@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from io import FileIO
@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 
 #: Start of every line of results, which distinguishes a truncated line from a foreign file.
 _LINE_START = b'{"source": "'
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 _ANOTHER = "name the file that --json wrote before"
 
 
@@ -63,8 +64,9 @@ def file_facts(path: str) -> dict[str, Any] | None:
 
 @dataclass(slots=True)
 class Lines:
-    """Makes the JSON lines of a run, with what its journal needs to be resumed."""
+    """Gives the JSON lines of a run, one a result, with what its journal needs to be resumed, to `put`."""
 
+    put: Callable[[str], None]
     head: Head
     #: Name of a source -> where it is opened; a source without a file is not among them.
     paths: Mapping[str, str]
@@ -73,13 +75,13 @@ class Lines:
     _source: str | None = None
     _facts: dict[str, Any] | None = None
 
-    def begin(self, source: str) -> None:
+    def begin(self, source: str, _scored: bool = False) -> None:
         """Look at the file of a source before it is decoded."""
         path = self.paths.get(source)
         self._source, self._facts = None, file_facts(path) if path is not None else None
 
-    def line(self, result: FrameResult, last: bool) -> str:
-        """The line of a result, without its end.
+    def write(self, result: FrameResult, last: bool) -> None:
+        """Give the line of a result, without its end.
 
         Args:
             result: of the source that was begun.
@@ -93,7 +95,7 @@ class Lines:
         if last:
             record["last"] = True
         self.begun, self._source = True, result.source
-        return json.dumps(record, allow_nan=False)
+        self.put(json.dumps(record, allow_nan=False))
 
 
 class Journal:
@@ -120,7 +122,7 @@ class Journal:
     def _open(self) -> None:
         """Open and lock the file. One that it replaces stays locked, so that no other run goes on in that."""
         with writable(self._path):
-            opener = None if is_stream(self._path) else _open_no_link
+            opener = None if is_stream(self._path) else lambda path, flags: os.open(path, flags | _NO_LINK, 0o666)
             self._file = self._open_files.enter_context(FileIO(self._path, "a", opener=opener))
         self._regular = stat.S_ISREG(os.fstat(self._file.fileno()).st_mode)
         try:
@@ -243,7 +245,3 @@ def _has_changed(source: str, facts: object, paths: Mapping[str, str]) -> bool:
     if changed:
         log.warning("%s has changed (%s); it is decoded again", source, ", ".join(changed))
     return bool(changed)
-
-
-def _open_no_link(path: str, flags: int) -> int:
-    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)

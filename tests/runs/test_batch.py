@@ -211,12 +211,13 @@ def test_a_changed_threshold_shows_in_the_provenance(name: str, value: object, m
 
 def write_journal(path: Path, names: str) -> bytes:
     """A journal of one frame per letter of `names`, of which the decoder of `d` was killed."""
-    journal, made = Journal(path), Lines(Head("1", {"cae": "auto"}), {})
+    journal = Journal(path)
+    made = Lines(journal.append, Head("1", {"cae": "auto"}), {})
     found = [replace(unreadable(Source(name, name), n, "why"), status="ok") for n, name in enumerate(names)]
     for result, following in zip(found, [*found[1:], None], strict=True):
         made.begin(result.source)
         last = following is None or following.source != result.source
-        journal.append(made.line(replace(result, retry=result.source == "d"), last))
+        made.write(replace(result, retry=result.source == "d"), last)
     journal.close()
     return path.read_bytes()
 
