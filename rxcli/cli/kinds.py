@@ -1,6 +1,5 @@
 """Kinds of values that options take: what the command line gives, checked and typed."""
 
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,8 @@ class Numbers(click.ParamType[tuple[Any, ...]]):
         is_size = not is_whole or (min(numbers, default=0) >= 0 and 0 not in numbers[-2:])
         if not (is_right and is_size and all(abs(number) < 1e6 for number in numbers)):  # written so that NaN fails
             count = "a list of" if self._any_count else f"{n} whole" if is_whole else n
-            self.fail(f"{value!r} is not {count} numbers, such as {self._example}", param, ctx)
+            bounds = "below a million, sizes above 0" if is_whole else "below a million"
+            self.fail(f"{value!r} is not {count} numbers ({bounds}), such as {self._example}", param, ctx)
         return numbers
 
 
@@ -49,9 +49,10 @@ class Exposure(click.ParamType[float]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Between 0 and 10 seconds."""
+        numerator, _, denominator = str(value).partition("/")
         try:
-            seconds = float(Fraction(str(value)))
-        except (ValueError, ZeroDivisionError, OverflowError):
+            seconds = float(numerator) / float(denominator or 1)
+        except (ValueError, ZeroDivisionError):
             seconds = 0.0
         if not 0 < seconds < 10:
             self.fail(f"{value!r} is no time; give seconds up to 10, or a fraction such as 1/8000", param, ctx)

@@ -113,7 +113,10 @@ def test_one_photo_loads_only_what_it_needs() -> None:
         (["simulate", "a.jpg", "--exposure", "1/0"], "'1/0' is no time"),
         (["live", "/dev/video9", "--exposure", "-1"], "'-1' is no time"),
         (["decode", "a", "--no-skip", "nix"], "no_skip must be one of no_screen"),
-        (["decode", "a", "--corners", "1,2", "3,4", "5", "6,7"], "'5' is not 2 numbers, such as 120.5,80"),
+        (
+            ["decode", "a", "--corners", "1,2", "3,4", "5", "6,7"],
+            "'5' is not 2 numbers (below a million), such as 120.5,80",
+        ),
         (["decode", "a", "--corners", "1,2", "3,4", "5,nan", "6,7"], "'5,nan' is not 2 numbers"),
         (["simulate", "a.jpg", "--corners", "1,2,3"], "'1,2,3' is not 8 numbers"),
         (["decode", "a", "--corners", "0,0", "9,9", "9,0", "0,9"], "corners must go once round a convex outline"),
