@@ -16,8 +16,8 @@ _PARTS = ((273, 279), (324, 325))
 #: TIFF 6.0, section 2, and BigTIFF: bytes of a value by its type; struct codes of types for offsets or lengths.
 _SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
 _TYPES = {3: "H", 4: "I", 13: "I", 16: "Q", 18: "Q"}
-#: The same of all numbers, and of pairs of integers, which are fractions.
-_NUMBERS, _FRACTIONS = _TYPES | {6: "b", 8: "h", 9: "i", 11: "f", 12: "d"}, {5: "I", 10: "i"}
+#: The same of all numbers, those of fractions two integers.
+_NUMBERS = _TYPES | {5: "II", 6: "b", 8: "h", 9: "i", 10: "ii", 11: "f", 12: "d"}
 #: No camera writes more; damaged files point in circles.
 _MAX_DIRECTORIES, _MAX_ENTRIES, _MAX_VALUES_BYTES = 32, 4096, 1 << 24
 #: Directories may share values; not many times over.
@@ -86,7 +86,8 @@ class Directories:
             return []
         main = next(iter(self._found.values()), [])
         exif = [entry for at in self._values(main, _EXIF)[:1] for entry in self._found.get(at, [])]
-        return [(entry[0], self._value(entry)) for entry in (*exif, *main)]
+        found = ((entry[0], self._value(entry)) for entry in (*exif, *main))
+        return [(tag, value[0] if len(value) == 1 else value) for tag, value in found]
 
     def values(self, tag: int) -> set[int]:
         """Values of a tag in all directories."""
@@ -95,23 +96,14 @@ class Directories:
     def _values(self, directory: Directory, wanted: int) -> tuple[int, ...]:
         """The offsets or lengths of a tag; none where it is absent or absurd."""
         entries = (entry for entry in directory if entry[0] == wanted and entry[1] in _TYPES)
-        return next((self._numbers(entry, _TYPES) for entry in entries), ())
+        return next((self._value(entry) for entry in entries), ())
 
-    def _value(self, entry: Entry) -> Any:
-        """The value of an entry as `tags` gives it."""
-        if entry[1] in _NUMBERS:
-            numbers: tuple[float, ...] = self._numbers(entry, _NUMBERS)
-        elif entry[1] in _FRACTIONS:
-            parts = self._numbers(entry, _FRACTIONS)
-            fractions = zip(parts[::2], parts[1::2], strict=True)
-            numbers = tuple(above / below if below else nan for above, below in fractions)
-        else:
-            return self._content(entry)
-        return numbers[0] if len(numbers) == 1 else numbers
-
-    def _numbers(self, entry: Entry, forms: dict[int, str]) -> tuple[int, ...]:
-        content = struct.iter_unpack(self._order + forms[entry[1]], self._content(entry))
-        return tuple(number for (number,) in content)
+    def _value(self, entry: Entry) -> tuple[Any, ...]:
+        """The numbers of an entry, or all its bytes."""
+        if entry[1] not in _NUMBERS:
+            return (self._content(entry),)
+        numbers = struct.iter_unpack(self._order + _NUMBERS[entry[1]], self._content(entry))
+        return tuple((above / below[0] if below[0] else nan) if below else above for above, *below in numbers)
 
     def _content(self, entry: Entry) -> bytes:
         """The bytes of an entry's value; none where they are cut or absurd."""

@@ -135,8 +135,6 @@ class PhotoCollector(Collector):
 
 def with_events(result: FrameResult, events: Sequence[Event]) -> FrameResult:
     """Add completed messages and files to a result."""
-    if not events:
-        return result
     return replace(
         result,
         messages=result.messages + tuple(e for e in events if isinstance(e, Message)),

@@ -69,8 +69,7 @@ def known_options(exposure: Exposure) -> ReceiverOptions:
     scene = exposure.scene
     tone = scene.isp.tone if scene.isp.tone in ("linear", "srgb", "bt709") else "auto"
     camera = msgspec.structs.replace(build_camera_profile(scene, exposure), tone=tone)
-    is_corrected = scene.isp.correct_distortion and not scene.is_mosaic
-    corners = corrected_corners(exposure.view) if is_corrected else exposure.corners
+    corners = corrected_corners(exposure.view) if scene.is_corrected else exposure.corners
     return ReceiverOptions(screens=(scene.screen,), cameras=(camera,), force_camera=True, corners=corners)
 
 

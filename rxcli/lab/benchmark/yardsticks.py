@@ -58,8 +58,7 @@ def column_waves(trial: Trial) -> tuple[FloatArray, float]:
         (columns, rows) float64; rows per slot, by the camera's line delay.
     """
     scene, view, frame = trial.capture.scene, trial.capture.exposure.view, trial.frame
-    corrected = scene.isp.correct_distortion and not scene.is_mosaic
-    picture = undistorted(frame, Lens(view.camera_matrix, np.array(scene.lens.distortion), corrected))
+    picture = undistorted(frame, Lens(view.camera_matrix, np.array(scene.lens.distortion), scene.is_corrected))
     # Corners where a lens without distortion would show them.
     plane = corrected_corners(view)
     top_left, top_right, bottom_right, bottom_left = plane

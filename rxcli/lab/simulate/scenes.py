@@ -138,6 +138,11 @@ class Scene:
         return self.output == "raw" and self.sensor.cfa != "rgb"
 
     @property
+    def is_corrected(self) -> bool:
+        """Whether the lens's distortion is taken out of a frame in memory; of a mosaic it never is."""
+        return self.isp.correct_distortion and not self.is_mosaic
+
+    @property
     def view(self) -> View:
         """How the camera sees the screen."""
         return View(self.screen, self.lens, self.pose, self.sensor.width, self.sensor.height, self.sensor.pixel_aspect)

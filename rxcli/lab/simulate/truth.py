@@ -84,8 +84,7 @@ def build_camera_profile(scene: Scene, exposure: Exposure) -> CameraProfile:
     timing: dict[str, Any] = {"line_delay_s": sensor.line_delay_s, "exposure_s": scene.exposure_s}
     mode = ReadoutMode(name="simulated", **size, **timing, frame_rate_hz=scene.frame_rate_hz)
     matrix: Any = tuple(map(tuple, exposure.view.camera_matrix.tolist()))
-    is_corrected = scene.isp.correct_distortion and not scene.is_mosaic
-    model = LensModel(**size, camera_matrix=matrix, dist_coeffs=lens, distortion_already_corrected=is_corrected)
+    model = LensModel(**size, camera_matrix=matrix, dist_coeffs=lens, distortion_already_corrected=scene.is_corrected)
     named: dict[str, Any] = {"name": scene.camera_name, "make": scene.make, "models": (scene.model,)}
     about = f"written by {_AUTHOR}"
     return CameraProfile(format=1, kind="camera", **named, modes=(mode,), lens=model, description=about)
