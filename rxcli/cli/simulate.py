@@ -184,14 +184,8 @@ def _with_pose(scene: Scene, options: dict[str, Any]) -> Scene:
 
 
 def _delays(delays: tuple[float, ...], n_columns: int) -> float | tuple[float, ...]:
-    n = len(delays)
-    refuse(
-        (
-            n not in (1, n_columns),
-            f"--column-delays takes 1 or {n_columns} numbers (got {n})",
-            "give one for all, or one each",
-        )
-    )
+    n, step = len(delays), "give one for all, or one each"
+    refuse((n not in (1, n_columns), f"--column-delays takes 1 or {n_columns} numbers (got {n})", step))
     return delays if n > 1 else delays[0]
 
 
