@@ -1,5 +1,7 @@
 """Means, grids and lens models that several calibrations need."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -8,6 +10,18 @@ from rxcli.types import FloatArray
 
 #: Residual, in standard deviations, from which values weigh less (Huber).
 _HUBER = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class ConvertedLens:
+    """The receiver's lens model, from a model of another kind."""
+
+    lens: LensModel
+    #: Largest distance between the points of both models over the picture, pixels.
+    worst_px: float
+    #: Names there; empty where there are none.
+    camera: str
+    lens_name: str
 
 
 def weighted_mean(values: ArrayLike, sds: ArrayLike) -> tuple[float, float]:

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from rxcli.calibrate.fitting import fit_distortion, grid_points
+from rxcli.calibrate.fitting import ConvertedLens, fit_distortion, grid_points
 from rxcli.errors import InputError, ProfileError
 from rxcli.ingest.metadata import positive, text_of
-from rxcli.profiles import LensModel
 from rxcli.resources import read_limited
 from rxcli.types import FloatArray
 
@@ -31,15 +30,11 @@ _HINT = "use `vlc-rx calibrate lens`, or another profile"
 
 
 @dataclass(frozen=True, slots=True)
-class GyroflowProfile:
+class GyroflowProfile(ConvertedLens):
     """The lens and readout of a profile."""
 
-    lens: LensModel
     make: str
     model: str
-    lens_name: str
-    #: Largest distance between the fisheye's and the pinhole model's points over the picture, pixels.
-    worst_px: float
     #: Readout of the whole frame as typed in by a user, seconds; None where it is missing or impossible.
     readout_s: float | None
     #: True where the rows are read from the bottom to the top.
@@ -77,7 +72,7 @@ def load_gyroflow(path: Path, size: tuple[int, int] | None = None) -> GyroflowPr
     rays, points = _rays(matrix, coefficients, size, path)
     lens, worst = fit_distortion(rays, points, matrix[[0, 1], [0, 1]], matrix[:2, 2], size)
     make, model, lens_name = (text_of(raw.get(key)) or "" for key in ("camera_brand", "camera_model", "lens_model"))
-    return GyroflowProfile(lens, make, model, lens_name, worst, *_readout(raw))
+    return GyroflowProfile(lens, worst, f"{make} {model}".strip(), lens_name, make, model, *_readout(raw))
 
 
 def _calibrated(raw: dict[str, Any]) -> tuple[FloatArray, FloatArray, tuple[int, int]]:

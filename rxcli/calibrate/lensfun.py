@@ -4,14 +4,12 @@ Lensfun's distortion polynomials (ptlens, poly3, poly5) lead, as OpenCV's do, fr
 picture. They are converted to k1 k2 k3 by least squares over the picture.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from rxcli.calibrate.fitting import fit_distortion, grid_points
+from rxcli.calibrate.fitting import ConvertedLens, fit_distortion, grid_points
 from rxcli.errors import ProfileError, UsageError, require
-from rxcli.profiles import LensModel
 from rxcli.types import Metadata
 
 #: Diagonal of the full frame, millimetres, to which crop factors refer.
@@ -20,19 +18,7 @@ _FULL_FRAME_DIAGONAL_MM = float(np.hypot(36, 24))
 _GRID = (25, 17)
 
 
-@dataclass(frozen=True, slots=True)
-class LensfunModel:
-    """A lens of the database."""
-
-    lens: LensModel
-    #: Names in the database.
-    camera_name: str
-    lens_name: str
-    #: Largest distance between lensfun's and OpenCV's points over the field, pixels.
-    worst_px: float
-
-
-def lens_from_database(metadata: Metadata, width: int, height: int) -> LensfunModel:
+def lens_from_database(metadata: Metadata, width: int, height: int) -> ConvertedLens:
     """The lens model of a picture's camera, lens and focal length.
 
     Args:
@@ -64,7 +50,7 @@ def lens_from_database(metadata: Metadata, width: int, height: int) -> LensfunMo
     centre = np.array([width - 1, height - 1]) / 2
     rays, points = ((part - centre) / focal_px for part in (undistorted, distorted))
     model, worst = fit_distortion(rays, points, focal_px, centre, (width, height))
-    return LensfunModel(model, f"{camera.maker} {camera.model}", lens.model, worst)
+    return ConvertedLens(model, worst, f"{camera.maker} {camera.model}", lens.model)
 
 
 def _find_camera(database: Any, metadata: Metadata) -> Any:

@@ -9,10 +9,11 @@ from typing import Any
 
 import click
 
+from rxcli.calibrate.fitting import ConvertedLens
 from rxcli.calibrate.frames import frame_light
-from rxcli.calibrate.gyroflow import GyroflowProfile, load_gyroflow
+from rxcli.calibrate.gyroflow import load_gyroflow
 from rxcli.calibrate.lens import Board, GrayImage, Rejected, calibrate_lens, find_boards
-from rxcli.calibrate.lensfun import LensfunModel, lens_from_database
+from rxcli.calibrate.lensfun import lens_from_database
 from rxcli.calibrate.picture import write_residuals
 from rxcli.calibrate.saving import profile_to_extend, with_lens, with_mode, write_profile
 from rxcli.calibrate.shutter import ShutterCalibration, calibrate_shutter
@@ -124,11 +125,9 @@ def _distortion(model: LensModel) -> tuple[str, str]:
     return "distortion", " ".join(f"{value:.5f}" for value in model.dist_coeffs) + "  (k1 k2 p1 p2 k3)"
 
 
-def _converted_report(
-    found: LensfunModel | GyroflowProfile, camera: str, at: str, source: str
-) -> tuple[dict[str, Any], list[tuple[str, str]]]:
+def _converted_report(found: ConvertedLens, at: str, source: str) -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """The record and the lines of a lens model that was converted from another; `at` follows the lens's name."""
-    name, model = found.lens_name, found.lens
+    camera, name, model = found.camera, found.lens_name, found.lens
     return {"camera": camera, "lens": name, **_lens_record(model), "worst_px": found.worst_px}, [
         ("camera", camera or "not named"),
         ("lens", f"{name or 'not named'}{at}"),
@@ -332,7 +331,7 @@ def lensfun(path: Path, **given: Any) -> None:
     metadata = replace(frame.metadata, **{key: value for key, value in given.items() if value})
     found = lens_from_database(metadata, frame.width, frame.height)
     at = f" at {metadata.focal_length_mm:g} mm"
-    record, lines = _converted_report(found, found.camera_name, at, "lensfun's own")
+    record, lines = _converted_report(found, at, "lensfun's own")
     wanted.write(record, lines, metadata, lambda profile: with_lens(profile, found.lens, metadata.lens))
 
 
@@ -363,8 +362,8 @@ def gyroflow(path: Path, size: tuple[int, int] | None, photo: Path | None, scree
     def extended(profile: CameraProfile) -> CameraProfile:
         return with_lens(_with_shutter(profile, measured) if measured else profile, found.lens, found.lens_name or None)
 
-    camera, at = f"{found.make} {found.model}".strip(), f", {found.lens.width} x {found.lens.height}"
-    record, lines = _converted_report(found, camera, at, "the fisheye model")
+    at = f", {found.lens.width} x {found.lens.height}"
+    record, lines = _converted_report(found, at, "the fisheye model")
     record |= {"readout_told_s": found.readout_s, "reversed": found.reversed, "notes": notes}
     record["readout_measured_s"] = measured.readout_s if measured else None
     lines += [("readout", warning) for warning in notes]
