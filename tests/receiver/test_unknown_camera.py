@@ -94,7 +94,7 @@ def test_packets_decide_between_hypotheses(tmp_path: Path, monkeypatch: pytest.M
 
 def test_without_packets_there_is_no_camera_but_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frame, _ = _frame(tmp_path)
-    for proposed in ([], _proposed(1.13 * ROWS_PER_SLOT, 0.7 * ROWS_PER_SLOT)):
+    for proposed in ([], _proposed(1.2 * ROWS_PER_SLOT, 0.7 * ROWS_PER_SLOT)):
         failure = _chosen(frame, proposed, monkeypatch)
         assert isinstance(failure, Failure)
         assert failure.reason in ("no_headers", "no_header")

@@ -71,15 +71,14 @@ def red_contrast(frame: Frame, share: float = 1.0, noise: RowNoise | None = None
         return _contrast(_thinned(frame, frame.mosaic), noise)
     if frame.colours is None:
         return None
-    if noise is not None:
-        return _contrast(
-            tone_to_light("linear" if frame.linear else "srgb", frame.colours.thinned().astype(np.float64)), noise
-        )
-    if share < 1 and frame.colours.first_rows is not None:
+    if noise is None and share < 1 and frame.colours.first_rows is not None:
         of_part = _contrast(frame.colours.first_rows(share))
         if of_part is not None and of_part[0] > COLOUR.plainly:
             return of_part
-    return _contrast(frame.colours.thinned())
+    thinned: NDArray[np.floating] = frame.colours.thinned()
+    if noise is not None and not frame.linear:
+        thinned = tone_to_light("srgb", thinned.astype(np.float64))
+    return _contrast(thinned, noise)
 
 
 def _contrast(thinned: NDArray[np.floating], noise: RowNoise | None = None) -> tuple[float, float] | None:
@@ -89,16 +88,10 @@ def _contrast(thinned: NDArray[np.floating], noise: RowNoise | None = None) -> t
 
     cells = cv2.resize(thinned, (COLOUR.n_cells, len(thinned)), interpolation=cv2.INTER_AREA)
     if noise is not None:
-        x, by_colour = (
-            (np.arange(COLOUR.n_cells) + 0.5) / COLOUR.n_cells - 0.5,
-            np.asarray(cells.T, np.float32, order="C"),
-        )
-        cells = np.stack([noise.removed(colour, x) for colour in by_colour]).T
-    mean, step = (cells[1:] + cells[:-1]) / 2, np.diff(cells, axis=0)
-    red, green = (
-        step[..., 0] / np.maximum(mean[..., 0], COLOUR.dark),
-        step[..., 1] / np.maximum(mean[..., 1], COLOUR.dark),
-    )
+        x = (np.arange(COLOUR.n_cells) + 0.5) / COLOUR.n_cells - 0.5
+        cells = np.stack([noise.removed(np.ascontiguousarray(colour.T), x).T for colour in np.moveaxis(cells, 2, 0)], 2)
+    mean = (cells[1:] + cells[:-1]) / 2
+    red, green, _ = np.moveaxis(np.diff(cells, axis=0) / np.maximum(mean, COLOUR.dark), 2, 0)
     faintest, brightest = mean[..., :2].min(axis=-1), np.maximum(cells[1:], cells[:-1]).max(axis=-1)
     weight = np.square(faintest) * (faintest > COLOUR.dark) * (brightest < COLOUR.clipped)
     beside = np.zeros_like(green)

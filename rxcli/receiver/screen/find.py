@@ -232,7 +232,7 @@ def _is_plain(grid: Grid) -> bool:
 
 def _starts(strips: PictureStrips, combs: Sequence[Comb], sigma: float) -> list[_Placed]:
     """Grids of combs, moved to their columns, as contrast needs borders that are in their place already."""
-    some = _half(strips)
+    some = strips.blocks(slice(None, None, 2))
     grids = (moved_by_waveforms(some, grid_of_comb(comb, strips), sigma, _FIRST_STEPS) for comb in combs)
     return [(strips, with_light(some, grid, sigma)) for grid in grids]
 
@@ -262,11 +262,6 @@ def _leaning_starts(along: Callable[[Course], PictureStrips], course: Course, si
         found += _starts(strips, find_combs(strips.without_common_light()), sigma)
         course = max(found, key=lambda own: _score(own[1]))[1].course if found else course
     return found
-
-
-def _half(strips: PictureStrips) -> PictureStrips:
-    """Every second window."""
-    return strips.blocks(slice(None, None, 2))
 
 
 def _fitted(

@@ -48,11 +48,7 @@ def viewer_order(corners: FloatArray, orientation: int) -> FloatArray:
 def lens_for(model: LensModel, width: int, height: int) -> Lens:
     """The lens model of a profile, scaled to a picture of `width` x `height`."""
     sx, sy = width / model.width, height / model.height
-    matrix = np.array(model.camera_matrix, np.float64)
-    matrix[0] *= sx
-    matrix[1] *= sy
-    matrix[0, 2] += (sx - 1) / 2
-    matrix[1, 2] += (sy - 1) / 2
+    matrix = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]]) @ np.array(model.camera_matrix)
     return Lens(matrix, np.array(model.dist_coeffs, np.float64), model.distortion_already_corrected)
 
 
