@@ -25,7 +25,7 @@ slots add to these.
 from rxcli.receiver.channel.likelihoods import SlotLikelihoods, slot_likelihoods
 from rxcli.receiver.channel.model import ObservationModel, estimate_black_level, estimate_tails
 from rxcli.receiver.channel.patterns import beyond_slots, initial_llr, lit_of, llr_of
-from rxcli.receiver.channel.steady import without_steady_light
+from rxcli.receiver.channel.steady import within_light, without_steady_light
 
 __all__ = [
     "ObservationModel",
@@ -37,5 +37,6 @@ __all__ = [
     "lit_of",
     "llr_of",
     "slot_likelihoods",
+    "within_light",
     "without_steady_light",
 ]

@@ -1,4 +1,7 @@
-"""Light on the screen that does not blink, as a window's reflection: no black level, as it is at some places only."""
+"""Rows that show no slots, as a film's bars; and light that does not blink, as a window's reflection.
+
+Neither is a black level, since they are at some places only.
+"""
 
 from dataclasses import replace
 
@@ -11,6 +14,8 @@ from rxcli.types import Clock, RowProfiles
 #: Slots within which a column is dark at some time; longest exposure, slots, that sees it; slots over which light is
 #: averaged; share of the light from which what does not blink counts.
 _DARK_WITHIN, _MAX_EXPOSURE, _SMOOTH, _MIN_SHARE = 20, 1.5, 0.5, 0.1
+#: Standard deviations, beyond a share of the brightest light, from which there is light at all.
+_SURE, _FAINT_SHARE = 5.0, 0.02
 
 
 def without_steady_light(profiles: RowProfiles, clock: Clock) -> RowProfiles:
@@ -48,3 +53,29 @@ def without_steady_light(profiles: RowProfiles, clock: Clock) -> RowProfiles:
         return profiles
     whole = np.pad(np.repeat(steady, rows, axis=1), ((0, 0), (0, shape[2] - n * rows)), mode="edge")
     return replace(profiles, light=profiles.light - whole.reshape(shape) * profiles.inside)
+
+
+def within_light(profiles: RowProfiles, clock: Clock, sigma: float) -> RowProfiles:
+    """Row profiles without the rows before the first light in any column and after the last.
+
+    The bars of a film are as high in all columns, and look like dark slots.
+
+    Args:
+        profiles: of the screen's columns.
+        clock: of its slots.
+        sigma: standard deviation of a dark row of a strip.
+    """
+    inside = np.asarray(profiles.inside.any(axis=1))
+    if not inside.any():
+        return profiles
+    rows = max(round(_SMOOTH * clock.rows_per_slot), 1)
+    light = local_mean(profiles.light.mean(axis=1), rows)
+    black, white = np.percentile(light[inside], (5, 95))
+    faint = _SURE * sigma / (rows * profiles.light.shape[1]) ** 0.5
+    is_lit = inside & (light > black + faint + _FAINT_SHARE * (white - black))
+    if not is_lit.any():
+        return profiles
+    top, n_rows = inside.argmax(axis=1)[:, None], np.maximum(inside.sum(axis=1), 1)[:, None]
+    height = (np.arange(inside.shape[1]) - top) / n_rows
+    shown = (height >= np.min(height[is_lit])) & (height <= np.max(height[is_lit]))
+    return replace(profiles, inside=profiles.inside & shown[:, None])

@@ -11,7 +11,7 @@ from rxcli.types import BELIEVABLE, BoolArray, Float32Array
 #: Columns of most screens. Evidence is scaled to them: narrower columns show the same light several times.
 USUAL_COLUMNS = 20
 #: Correlation of the slots of neighbouring columns from which they have the same packet.
-_REPEATED = 0.7
+REPEATED = 0.7
 
 
 def log_evidence(reception: Reception) -> float:
@@ -37,7 +37,7 @@ def believable(reception: Reception) -> BoolArray:
 
 def is_whole(reception: Reception) -> bool:
     """Whether every column has a believable packet that is not its neighbour's."""
-    return bool(believable(reception).any(axis=0).all() and (repeated_share(reception) < _REPEATED).all())
+    return bool(believable(reception).any(axis=0).all() and (repeated_share(reception) < REPEATED).all())
 
 
 def score(reception: Reception, evidence: float, log_prior: float) -> float:

@@ -32,9 +32,9 @@ class Hypothesis:
         """Equal for hypotheses that an initial pass cannot distinguish; also the order of ties."""
         estimate = self.camera.hypothesis
         return (
-            self.way,
             self.outline.family,
-            estimate.number if estimate else 0,
+            # Estimates are numbered in each way by themselves.
+            (self.way, estimate.number) if estimate else (0, 0),
             self.camera.reversed,
             self.screen.packet_slots,
             self.screen.columns,

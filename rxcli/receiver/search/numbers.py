@@ -42,7 +42,7 @@ def rated_by_packets(best: Scored, outlines: Sequence[Outline], proposer: Propos
             continue
         nearest = min(rivals, key=lambda index: abs(shifts[index]))
         gained, n = 0.0, shifts[nearest]
-        if _existence(best.reception, n) < 0:
+        if _existence(best.reception, n) <= 0:
             moved = replace(best.hypothesis, outline=outlines[nearest], camera=best.context.camera)
             profiles = proposer.context(moved).sample_columns(n_columns)
             read = slice(-n - _BESIDE - 1, None) if n > 0 else slice(0, -n + _BESIDE + 1)
@@ -58,13 +58,16 @@ def _existence(reception: Reception, n: int) -> float:
     """Log-likelihood ratio that the first `n` columns of a reception, or the last `-n`, are columns of the screen.
 
     Beyond the screen there is no packet but that of a neighbour, whose light spreads. Within it there are packets, or
-    there are none because it is dark, by the rule of succession from the columns beside.
+    there are none because it is dark, by the rule of succession from the columns beside. What is out of the picture
+    counts for neither.
     """
     shown = SETTINGS.outer_weight * np.maximum(reception.posteriors.log_evidence, 0.0)
-    repeated = evidence.repeated_share(reception).clip(0, 1)
+    repeated, in_view = evidence.repeated_share(reception), np.asarray(reception.n_observed.any(axis=(0, 2)))
     if n < 0:
-        n, shown, repeated = -n, shown[::-1], repeated[::-1]
-    shown = shown[:-1] * (1 - repeated)
+        n, shown, repeated, in_view = -n, shown[::-1], repeated[::-1], in_view[::-1]
+    if not in_view[:n].any():
+        return 0.0
+    shown = shown[:-1] * (1 - repeated / evidence.REPEATED).clip(0, 1)
     with_packets = (np.count_nonzero(shown[n : n + _BESIDE] > 1) + 1) / (_BESIDE + 2)
     return float(np.log1p(with_packets * (np.expm1(min(shown[:n].sum(), _MAX_SHOWN)) - 1)))
 

@@ -20,8 +20,8 @@ from rxcli.receiver.search.cameras import known_lens
 from rxcli.receiver.search.settings import SETTINGS
 from rxcli.types import FloatArray, Frame, Remark
 
-#: Log-odds of a bright part with four straight sides against the box around stripes.
-_BRIGHT_LOG_ODDS = 50.0
+#: Log-odds of the box around stripes against a bright part with four straight sides.
+_BOX_LOG_ODDS = -50.0
 
 
 def proposed_screens(cache: FrameCache, options: ReceiverOptions) -> list[list[Outline]] | Failure:
@@ -51,11 +51,12 @@ def without_borders(cache: FrameCache) -> list[Outline]:
         striped = cache.once("striped", lambda: find.striped_box(cache.plane))
     if striped is None:
         return []
-    # Sides that are seen are nearer than those of stripes.
     own = Outline(striped, SETTINGS.sure_certainty, column_offset=None, family=-1, stands_out=False)
     bright = _parts(cache)[0]
-    better = [] if bright is None else [replace(own, corners=bright, family=-2, log_odds=_BRIGHT_LOG_ODDS)]
-    return [_viewed(outline, frame) for outline in (*better, own)]
+    found = [own]
+    if bright is not None:  # Sides that are seen are nearer than those of stripes.
+        found = [replace(own, corners=bright, family=-2), replace(own, log_odds=_BOX_LOG_ODDS)]
+    return [_viewed(outline, frame) for outline in found]
 
 
 def _parts(cache: FrameCache) -> list[FloatArray | None]:

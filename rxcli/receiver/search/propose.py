@@ -7,7 +7,7 @@ import numpy as np
 
 from rxcli.options import ReceiverOptions
 from rxcli.profiles import ScreenProfile
-from rxcli.receiver.channel import without_steady_light
+from rxcli.receiver.channel import within_light, without_steady_light
 from rxcli.receiver.frame.acquisition import noise_of, variants_of
 from rxcli.receiver.frame.cache import FrameCache, key_of
 from rxcli.receiver.frame.camera import FrameCamera
@@ -138,7 +138,8 @@ class Proposer:
         is_long = clock is not None and clock.exposure_slots > LONG_EXPOSURE_SLOTS
         if clock is None or clock.header_peak_ratio < (1.0 if is_long else SETTINGS.min_lead):
             return None
-        return replace(hypothesis, clock=clock, profiles=without_steady_light(profiles, clock))
+        profiles = without_steady_light(within_light(profiles, clock, noise_of(profiles)), clock)
+        return replace(hypothesis, clock=clock, profiles=profiles)
 
     def contradicts(self, scored: Scored) -> bool:
         """Whether an estimate is not the camera that is stated, or its exposure that of a screen of another rate.
@@ -212,7 +213,7 @@ def ways(
     if outlines[0].family >= 0 and (without := without_borders(cache)):
         # Of one column that sends alone, its own rows give the camera, and given corners its number.
         is_given = options.corners is not None
-        yield replace(less_likely, outlines=tuple(outlines if is_given else without), lit=tuple(without))
+        yield replace(less_likely, outlines=(*outlines, *(() if is_given else without)), lit=tuple(without))
     if not may_doubt:
         return
     frame, estimated = cache.frame, replace(options, cameras=(), force_camera=False)

@@ -122,6 +122,26 @@ def test_light_that_does_not_blink_is_taken_off_where_it_is() -> None:
     assert np.abs(left[2:4, :, 40:500]).mean() < 0.05
 
 
+def test_rows_of_bars_are_no_dark_slots() -> None:
+    """The bars of a film are left out, but not the dark slots that some columns begin and end with."""
+    link = random_link(np.random.default_rng(1), [5] * 6, 3)
+    shot_gain = Shot(texture=0.3, sigma=0.001, n_rows=1000)
+    profiles = row_profiles(link, shot_gain, np.random.default_rng(2))
+    clock, sigma = true_clock(shot_gain, link.packet_slots, 6), 0.001
+    whole = channel.within_light(profiles, clock, sigma).inside
+    noise = np.random.default_rng(3).normal(0, sigma, profiles.light.shape).astype(np.float32)
+    row = np.arange(1000)
+    light = np.where((row >= 200) & (row < 900), profiles.light, noise)
+    inside = channel.within_light(replace(profiles, light=light), clock, sigma).inside.all(axis=(0, 1))
+    for shown, seen in ((whole.all(axis=(0, 1)), profiles.light), (inside, light)):
+        lit = np.flatnonzero((seen > 0.1).any(axis=(0, 1)))
+        np.testing.assert_allclose(np.flatnonzero(shown)[[0, -1]], lit[[0, -1]], atol=clock.rows_per_slot)
+        assert shown[lit[0] + 5 : lit[-1] - 5].all()
+    # Nothing is left out where there is no light at all.
+    black = replace(profiles, light=noise * 0)
+    assert channel.within_light(black, clock, sigma) is black
+
+
 def test_sigma_is_the_noise_of_a_dark_sample() -> None:
     """Dark parts of a picture: a tenth of the light is left."""
     for sigma in (0.0005, 0.002):

@@ -156,6 +156,22 @@ def test_columns_with_packets_are_not_left_out_of_the_screen() -> None:
     assert max(one.log_odds for one in less_likely) < -3.0
 
 
+def test_columns_out_of_the_picture_say_nothing_of_the_number() -> None:
+    """Cut off at its right: the outermost column of the outline is as open as one more to the left would be."""
+    trial = trial_of("paper-17k3")
+    cut = replace(trial.frame, pixels=trial.frame.pixels[:, : int(trial.corners[[1, 2], 0].min()) - 60])
+    cache, options = FrameCache(cut), replace(trial.options(), cameras=(), force_camera=False)
+    side = (trial.corners[1] - trial.corners[0]) / 20
+    own = Outline(trial.corners)
+    found = search(cache, options, outlines=[own])
+    assert isinstance(found, Found)
+    assert not found.best.reception.n_observed[:, -1].any()
+    rival = replace(own, corners=trial.corners - side, log_odds=-1.0)
+    _, rated = rated_by_packets(found.best, [own, rival], Proposer(cache, options, (own, rival)))
+    # No packet stands left of the screen, and none could at its right.
+    assert rated.log_odds < -1.5
+
+
 @pytest.mark.parametrize("shift", [-1, 1])
 def test_a_column_with_a_packet_beside_the_outline_corrects_its_number(shift: int) -> None:
     trial = trial_of("paper-17k3")
@@ -300,6 +316,19 @@ def test_ways_to_look_at_a_picture_come_in_the_order_of_their_likelihood() -> No
     assert [way.cache.frame.metadata.exposure_s for way in looked if way.doubts] == [1e-4, None]
     assert [way.options.cameras for way in looked if way.doubts] == [(), ()]
     assert not any(way.doubts for way in ways(FrameCache(stated), options, outlines))
+
+
+def test_a_bright_box_shows_the_camera_and_a_grid_the_columns() -> None:
+    """Where a grid's light misleads the estimate of the camera, that of the box may be right, and is tried on both."""
+    trial = trial_of("paper-17k3")
+    own, options = Outline(trial.corners), ReceiverOptions(screens=SHIPPED)
+    _, boxes = ways(FrameCache(trial.frame), options, [own])
+    assert boxes.outlines[0] is own
+    assert len(boxes.outlines) > 1
+    assert boxes.lit == boxes.outlines[1:]
+    assert {one.outline.family for one in next(boxes.cameras())} == {own.family, *(box.family for box in boxes.lit)}
+    _, given = ways(FrameCache(trial.frame), replace(options, corners=trial.corners), [own])
+    assert given.outlines == (own,)
 
 
 @pytest.mark.parametrize(
