@@ -123,7 +123,7 @@ def _weights(text: str, columns: int) -> NDArray[np.int64]:
     reason = f"--weights {text}: no number, list of {columns} numbers, or JSON file of such lists"
     with failure_explained(reason, "give 1..9 for every column", UsageError):
         found = [int(part) for part in text.split(",")] if data is None else json.loads(data)
-        values = np.asarray(found, np.int64)
+        values = np.asarray(found).astype(np.int64, casting="safe")
         weights = np.broadcast_to(values, (values.shape[0] if values.ndim == 2 else 1, columns))
     refuse((weights.min() < 1 or weights.max() > 9, f"--weights {text}: weights are 1 to 9", "choose from 1..9"))
     return weights

@@ -100,6 +100,13 @@ def test_what_cannot_work_is_refused(
     assert (out.read_bytes() if out.exists() else None) == before
 
 
+def test_weights_that_are_no_whole_numbers_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    weights = tmp_path / "w.json"
+    weights.write_text("5.5")
+    assert encode("--text", "a", "--weights", weights, "--out", tmp_path / "x.npy") == ExitCode.USAGE
+    assert "give 1..9 for every column" in capsys.readouterr().err
+
+
 SCREEN = """format = 1
 kind = "screen"
 name = "bench-12"
