@@ -27,6 +27,8 @@ _PARTS, _BESIDE = 8, 3
 _SURE, _BLACK, _LIT_ROWS = 4.0, 4.0, 0.2
 #: Light of one grey level of 255; maximum log-odds by which a part that never goes out is no column.
 _GREY_LEVEL, _MAX_STEADY = 255.0**-2, 2.0
+#: Width of a margin, picture widths; root of the light, of white, below which nothing was exposed.
+_MARGIN, _NO_LIGHT = 0.04, 0.001
 #: Columns to either side of the picture's middle one that are looked at: on a plane seen nearly edge-on there are any
 #: number.
 _FURTHEST = 200
@@ -131,21 +133,31 @@ def light_profile(
     lit = _lit_rows(strips, light).astype(np.float64)
     n_lit = np.maximum(total(lit), 1)
     shown = total(lit) > 0
-    is_faint, faint = _faint_light(total(lit * np.sqrt(np.maximum(strips.level, 0))) / n_lit, shown)
+    root, place = total(lit * np.sqrt(np.maximum(strips.level, 0))) / n_lit, origin + (np.arange(n) + 0.5) / _PARTS
+    is_faint, faint = _faint_light(root, shown)
     level = np.log(total(lit * strips.level) / n_lit + _GREY_LEVEL)
     darkest = total(lit * np.log(strips.darkest + _GREY_LEVEL)) / n_lit
     level = np.clip(1 + (level - np.quantile(level[shown], 1 - _DARK)) / _BLACK, 0, 1) * shown
     of_columns = darkest[shown & (coherent > 0.5)]
     usual = np.median(of_columns) if of_columns.size else np.inf
     steady = np.clip(darkest - usual, 0, _MAX_STEADY) * (1 - coherent) * shown
-    place = origin + (np.arange(n) + 0.5) / _PARTS
+    # Without a lens's distortion a picture has margins that are not of the sensor.
+    left, right = np.flatnonzero(count)[[0, -1]]
+    at_side = np.minimum(np.arange(n) - left, right - np.arange(n)) < _MARGIN * (right - left)
+    in_picture = (count > 0) & ~(at_side & (root < _NO_LIGHT))
     corners = np.reshape(parts, (-1, 4, 2))
     across = grid.columns_at(corners)
     sides = np.stack([across[:, [0, 3]].mean(axis=1), across[:, [1, 2]].mean(axis=1)], axis=1)
     along = ScreenAxis.through(grid, 1, 1.0, 0.0).along(*grid.flat(corners))
     heights = along[:, 2:].mean(axis=1) - along[:, :2].mean(axis=1)
+    # A part that the picture cuts off goes on beyond it.
+    whole = (sides[:, 0] > place[in_picture].min(initial=np.inf)) & (
+        sides[:, 1] < place[in_picture].max(initial=-np.inf)
+    )
     middle = float(grid.coefficients[0])
-    return LightProfile(place, count > 0, coherent, level, steady, is_faint, faint, middle, sides, heights)
+    return LightProfile(
+        place, in_picture, coherent, level, steady, is_faint, faint, middle, sides[whole], heights[whole]
+    )
 
 
 def _lit_rows(strips: PictureStrips, light: Float32Array) -> BoolArray:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rxcli.lab.benchmark.trial import simulate_trial
+from rxcli.lab.simulate.scenes import preset
 from rxcli.receiver.plane.read import read_plane
 from rxcli.receiver.screen import find, geometry
 from rxcli.receiver.screen.bright import bright_parts
@@ -638,3 +640,19 @@ def test_a_tall_picture_takes_little_memory_or_is_refused() -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 20e6
+
+
+@pytest.mark.parametrize("margin", [0, 30])
+@pytest.mark.parametrize("picture", ["coffee", "sky"])
+def test_a_screen_that_a_picture_cuts_off_is_numbered_beside_a_black_margin(picture: str, margin: int) -> None:
+    """Light goes on where the picture ends, or where the margin of a corrected distortion begins."""
+    scene = preset("phone-plain", "paper-17k3").scaled(0.3, 0.5, keep_readout=True)
+    trial = simulate_trial(replace(scene, picture=picture), 3)
+    left, width = trial.corners[:, 0].min(), float(np.ptp(trial.corners[:, 0]))
+    pixels = trial.frame.pixels[:, : int(left + 0.7 * width)].copy()
+    pixels[:, pixels.shape[1] - margin :] = 0
+    plane = read_plane(replace(trial.frame, pixels=pixels))
+    parts = [part for part in bright_parts(plane) if part is not None]
+    best, *rivals = find_screens(plane, [ColumnLayout(20, 0.45, 16 / 9)], None, parts)[0]
+    assert abs(best.corners[0, 0] - left) < width / 40
+    assert all(rival.log_odds < -1.5 for rival in rivals)
