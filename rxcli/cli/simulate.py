@@ -33,8 +33,8 @@ _VIDEO_SUFFIXES = {".mp4": "h264", ".mov": "h264", ".mkv": "h264", ".avi": "mjpe
 
 #: Slots among the files of --waveforms.
 _SLOT_FILE = "slots.csv"
-#: Options that are fields of the scene by the same name.
 _CORNERS, _DELAYS = Numbers("120.5,80,900,80,900,600,120.5,600"), Numbers("0.1,0.25", any_count=True)
+#: Options that are fields of the scene by the same name.
 _SCENE_OPTIONS = ("picture", "n_frames", "frame_rate_hz", "start_slot", "slot_rate_error_ppm", "hand_px")
 
 
